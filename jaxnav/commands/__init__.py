@@ -71,6 +71,7 @@ COMMANDS = {
         in_folder=("drive.png", "map_*.png", "curves*.png", "reliability.png", "summary.json"),
     ),
     "run": Registered("drive.arguments:Run", "drive.run", made="record"),
+    "stop": Registered("drive.arguments:Stop", "drive.stop"),
     "ros": Registered("drive.arguments:Ros", "drive.ros", made="record"),
     "faults": Registered("drive.arguments:Faults", "drive.faults", file="json"),
     "view": Registered("drive.arguments:ViewDrive", "drive.view", made="out"),

@@ -23,6 +23,7 @@ from rosbags.rosbag2 import storage_mcap as _mcap
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from jaxnav.files import limits
+from jaxnav.files.reading import check_regular
 from jaxnav.files.unpacking import Budget, unpack_chunk, zstd_pieces
 
 RULE = "=" * 80 + "\n"  # between the definitions of a message's parts
@@ -88,6 +89,8 @@ class Ros2Reader(_Ros2Reader):
         _Ros2Reader.__init__(self, path)
         self._budget = Budget(0)
         for file in path.iterdir() if path.is_dir() else [path]:
+            if not file.is_dir():
+                check_regular(file)
             self._budget.left += Budget.of_file(file).left
         metadata = path / "metadata.yaml"
         if path.is_dir() and metadata.stat().st_size > limits.YAML_BYTES:

@@ -19,6 +19,7 @@ from jaxnav.datasets.recording import Rows
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
 from jaxnav.files.ranges import is_within
+from jaxnav.files.reading import open_file
 from jaxnav.files.unpacking import Budget, copy_bz2
 from jaxnav.ros.camera_messages import TAGSLAM
 from jaxnav.ros.odometry_messages import NAV_ODOMETRY
@@ -96,11 +97,7 @@ def read_bag(path: Path, odometry: str | None = None) -> Bag:
 @contextmanager
 def decompress_bag(path: Path) -> Iterator[Path]:
     """The path of the bag, or of a decompressed copy that is removed after the block."""
-    try:
-        with path.open("rb"):
-            pass
-    except OSError as error:
-        raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
+    open_file(path).close()
     if path.suffix != ".bz2":
         yield path
         return

@@ -69,6 +69,8 @@ def _reference(path: Path, stored: dict[str, np.ndarray]) -> dict[int, np.ndarra
 def _checked(path: Path) -> dict[str, np.ndarray]:
     try:
         stored = dict(read_npz(path, _KEYS.keys() | _REFERENCE_KEYS.keys() | {"obj_order"}))
+    except BadInput:
+        raise
     except Exception as error:
         # NumPy, zipfile and zlib may meet any bytes, and raise whatever they lead to.
         problem = f"is not a readable .npz file ({type(error).__name__}: {error})"

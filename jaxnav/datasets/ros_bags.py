@@ -70,7 +70,7 @@ def read_messages(path: Path, choose: Choose) -> Generator[ReceivedMessage, None
         BadInput: the path is no bag, a broken one, or one that ends too early; or `choose` raises.
     """
     if path.is_dir():
-        if not (path / "metadata.yaml").is_file():
+        if not (path / "metadata.yaml").exists():
             raise BadInput(path, "is no ROS 2 bag: it holds no metadata.yaml")
         yield from _read(path, path, Ros2Reader, choose)
     elif path.suffix in _ROS2_FILES and path.exists():

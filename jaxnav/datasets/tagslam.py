@@ -145,7 +145,7 @@ def _detections(
 def _body(path: Path, body: str) -> _BodyEntry | None:
     """The entry of the rig in tagslam.yaml; None without one."""
     file = path / "tagslam.yaml"
-    if not file.is_file():
+    if not file.exists():
         return None
     return _by_name(validate(TagSlamFile, read_mapping(file), file)).get(body)
 

@@ -58,6 +58,7 @@ class BaseFile(Entry):
     time_constant_s: Annotated[Positive, within("time_constant_s")]
     sigma: dict[str, NonNegative] = Field(default_factory=dict)
     gyro: GyroEntry | None = None
+    resume: bool = False
 
     @field_validator("sigma")
     @classmethod

@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from jaxnav.errors import BadInput, libraries_silenced
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
+from jaxnav.files.reading import check_regular, open_file
 
 _ORIENTATION = 0x0112
 MIRRORED = (2, 4, 5, 7)  # by EXIF's number
@@ -60,9 +61,14 @@ def decode_image(
     return np.ascontiguousarray(image)
 
 
-def open_video(file: str) -> cv2.VideoCapture:
-    """A video, whose frames come as stored, as pictures do; not open where OpenCV can't read it."""
-    capture = cv2.VideoCapture(file)
+def open_video(file: Path) -> cv2.VideoCapture:
+    """A video, whose frames come as stored, as pictures do; not open where OpenCV can't read it.
+
+    Raises:
+        BadInput: there is no such file, or it is no regular one.
+    """
+    check_regular(file)
+    capture = cv2.VideoCapture(str(file))
     capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
     return capture
 
@@ -118,11 +124,8 @@ def read_photograph(
     path: Path, flags: int = cv2.IMREAD_COLOR
 ) -> tuple[UInt8[np.ndarray, "rows columns *channels"], int]:
     """Read the image in a file as `read_image` does, and its `exif_orientation`."""
-    try:
-        with path.open("rb") as file:
-            raw = file.read(limits.IMAGE_BYTES + 1)
-    except OSError as error:
-        raise BadInput(path, f"can't be read: {(error.strerror or str(error)).lower()}") from None
+    with open_file(path) as file:
+        raw = file.read(limits.IMAGE_BYTES + 1)
     with libraries_silenced():
         image = decode_image(raw, flags)
     if image is None:

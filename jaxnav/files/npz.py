@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from jaxnav.files import limits
+from jaxnav.files.reading import open_file
 
 _PIECE = 2**20  # the most bytes read at once, by zip too for its list of files
 
@@ -24,11 +25,12 @@ def read_npz(
     """Read the arrays of an .npz: all of them, or those of some keys that it has.
 
     Raises:
+        BadInput: it is no regular file, or can't be opened.
         Exception: any that the bytes lead to in NumPy, zipfile, zlib and here.
     """
     arrays: dict[str, np.ndarray] = {}
     left = limits.NPZ_BYTES
-    with path.open("rb") as file:
+    with open_file(path) as file:
         if file.read(6) == np.lib.format.MAGIC_PREFIX:
             raise ValueError("it holds a single array")
         archive = zipfile.ZipFile(cast(IO[bytes], _Bounded(file)))

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Shaped
 from pydantic import Field
 
-from jaxnav.errors import BadInput
+from jaxnav.files.reading import open_file
 from jaxnav.files.validation import Entry, Text
 
 
@@ -44,12 +44,8 @@ def calibrated_now(tool: str, data: Iterable[Path | Shaped[np.ndarray, "..."]]) 
             digest.update(f"{item.dtype.str}{item.shape}".encode())
             digest.update(np.ascontiguousarray(item).tobytes())
         else:
-            try:
-                with item.open("rb") as file:
-                    digest.update(hashlib.file_digest(file, "sha256").digest())
-            except OSError as error:
-                reason = (error.strerror or str(error)).lower()
-                raise BadInput(item, f"can't be read: {reason}") from None
+            with open_file(item) as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
     return Calibrated(
         date=datetime.now(UTC).date().isoformat(), tool=tool, data_sha256=digest.hexdigest()
     )

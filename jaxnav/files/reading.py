@@ -7,8 +7,11 @@ OpenCV's matrices (`!!opencv-matrix`, in version 5 also `!!opencv-nd-matrix`) ar
 
 import json
 import re
+import stat
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
@@ -42,20 +45,49 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return data
 
 
+def check_regular(path: Path) -> None:
+    """Refuse what is no regular file, or leads to none, before it is opened: a pipe keeps its
+    reader waiting for ever, a device such as /dev/zero has no end.
+
+    Raises:
+        BadInput: it is something else, missing, or out of reach.
+    """
+    with _naming(path):
+        mode = path.stat().st_mode
+    if stat.S_ISDIR(mode):
+        raise BadInput(path, "is a folder, not a file")
+    if not stat.S_ISREG(mode):
+        raise BadInput(path, "is a device, a pipe or a socket: only regular files are read")
+
+
+def open_file(path: Path) -> BufferedReader:
+    """Open a regular file for reading.
+
+    Raises:
+        BadInput: it is no regular file, or can't be opened.
+    """
+    check_regular(path)
+    with _naming(path):
+        return path.open("rb")
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or str(error)
+        raise BadInput(path, f"can't be read: {reason.lower()}") from None
+
+
 def read_text(path: Path, max_bytes: int) -> str:
     """Read a UTF-8 file of at most `max_bytes`.
 
     Raises:
         BadInput: it can't be read, is larger than that, or is not UTF-8.
     """
-    try:
-        with path.open("rb") as file:
-            raw = file.read(max_bytes + 1)
-    except IsADirectoryError:
-        raise BadInput(path, "is a folder, not a file") from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or str(error)
-        raise BadInput(path, f"can't be read: {reason.lower()}") from None
+    with open_file(path) as file, _naming(path):
+        raw = file.read(max_bytes + 1)
     if len(raw) > max_bytes:
         raise BadInput(path, f"is larger than {max_bytes // 2**20} MiB")
     try:

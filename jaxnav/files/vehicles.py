@@ -16,6 +16,9 @@ a sensor be off by that much, and learns by how much it is. Left out it is 3 % o
 the steering angle, 0.5 degrees (0.0087 rad) of its offset and 20 ms. Four zeros make the sensors
 exact.
 
+`resume: true` lets the vehicle, of any kind, drive on after a stop because something was late, once
+all has been well for 2 s. It is for the person who writes the file: no calibration writes it.
+
 A base that is no car, and a gyro: see `bases.py`.
 """
 
@@ -52,7 +55,7 @@ from jaxnav.models.twist_base import TwistBase
 from jaxnav.parameters import TUNABLES
 
 _MOST_SIGMA = TUNABLES["motion.vehicle.sensor_sigma"].most
-_NO_FIGURES = ("base", "calibrated", "gyro", "sigma")
+_NO_FIGURES = ("base", "calibrated", "gyro", "resume", "sigma")
 
 
 class VehicleFile(Entry):
@@ -72,6 +75,7 @@ class VehicleFile(Entry):
     calibrated: Calibrated | None = None
     gyro: GyroEntry | None = None
     sigma: dict[str, NonNegative] = Field(default_factory=dict)  # of the keys above, by their names
+    resume: bool = False
 
     @field_validator("sigma")
     @classmethod
@@ -146,6 +150,18 @@ def load_vehicle(path: str | Path) -> Vehicle | TwistBase:
     if is_base_file(data):
         return validate(BaseFile, data, path).vehicle()
     return validate(VehicleFile, data, path).vehicle()
+
+
+def may_resume(path: Path) -> bool:
+    """Whether a vehicle's file allows it to drive on after a stop for being late.
+
+    Raises:
+        BadInput: as `load_vehicle`.
+    """
+    data = read_mapping(path)
+    if is_base_file(data):
+        return validate(BaseFile, data, path).resume
+    return validate(VehicleFile, data, path).resume
 
 
 def is_base_file(data: Mapping[str, Any]) -> bool:

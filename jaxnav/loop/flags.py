@@ -24,7 +24,7 @@ class Fault(enum.IntFlag):
     FAR_FROM_FIX = enum.auto()  # distance driven without a marker beyond its limit
     NOT_FINITE = enum.auto()  # the estimate was not finite
     RESTARTED = enum.auto()  # the belief was contradicted and given up
-    DETECTOR_FAILED = enum.auto()
+    HELD = enum.auto()  # by the guard: something was late, and the file says `resume: true`
     VEHICLE_FAILED = enum.auto()  # it could not be read or written
     DEADLINE_MISSED = enum.auto()  # a cycle took longer than its period
     RECORDER_BEHIND = enum.auto()  # messages were left out

@@ -8,7 +8,8 @@
 It has its own thread, uses the monotonic clock, and imports no JAX. It stops the vehicle when no
 fresh command came in time, when a watched thread hangs, on a command that is not a number, and when
 told to. It repeats the stop until the vehicle has heard it, and again after anything that might
-have undone it. Once tripped it does not arm again: to drive on, start a new drive.
+have undone it. Once tripped it does not arm again: to drive on, start a new drive. Only a vehicle
+whose file says `resume: true` may drive on after a stop for being late, see `resume`.
 
 A thread can't act while C code of the same process holds the interpreter, nor once the process is
 gone: vehicles that can be moved have a guard in a process of its own (see `guard_process`) as well
@@ -25,7 +26,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.interfaces import AnyVehicle
+from jaxnav.loop.interfaces import AnyVehicle, Resuming
 from jaxnav.loop.limits import CommandLimits
 
 TIMEOUT_S = 0.2
@@ -41,6 +42,7 @@ class Guard:
     Attributes:
         reason: why the guard has tripped; None: it has not.
         unheard: why the last stop did not reach the vehicle; None: it did, or there was none.
+        late: whether all that it has tripped for is something that did not come in time.
     """
 
     def __init__(
@@ -50,13 +52,16 @@ class Guard:
         timeout_s: float = TIMEOUT_S,
         now_ns: Callable[[], int] = time.monotonic_ns,
         corrections: Corrections | None = None,
+        resumes: bool = False,
     ):
         """Start disarmed: only commands to stand get through.
 
         Args:
             corrections: convert true angles to servo angles; by default they are the same.
             timeout_s: time from the last sign of life until the vehicle has been stopped.
+            resumes: whether the vehicle's file allows it to drive on, see `resume`.
         """
+        self._resumes, self.late = resumes, False
         self._vehicle, self._limits, self._now_ns = vehicle, limits, now_ns
         self._corrections = corrections or Corrections()
         self._timeout_ns = int((timeout_s - 1.5 * _LOOK_S) * 1e9)
@@ -77,8 +82,13 @@ class Guard:
 
     @property
     def tripped(self) -> bool:
-        """Whether the guard has stopped the vehicle for good."""
+        """Whether the guard has stopped the vehicle: for good, unless it `pauses`."""
         return self._tripped.is_set()
+
+    @property
+    def pauses(self) -> bool:
+        """Whether the guard has stopped the vehicle and may arm again."""
+        return self.tripped and self.late and self._resumes
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the guard trips or the time is over; return whether it has tripped."""
@@ -96,6 +106,13 @@ class Guard:
     def beat(self, name: str) -> None:
         """Note a sign of life of the calling thread; the first one begins its watch."""
         self._beats[name] = self._now_ns(), threading.get_ident()
+
+    def oldest_sign_ns(self) -> int | None:
+        """When the drive last came back as a whole: the oldest of the last signs of life of its
+        threads and of the commands; None while nothing has to come in time."""
+        if not self._armed:
+            return None
+        return min(self._written_ns, *(beat_ns for beat_ns, _ in list(self._beats.values())))
 
     def leave(self, name: str) -> None:
         """Stop watching a thread that ends normally."""
@@ -135,13 +152,35 @@ class Guard:
             self._deadline_ns = now_ns + self._timeout_ns if deadline_ns is None else deadline_ns
             return True
 
-    def trip(self, reason: str) -> None:
-        """Stop the vehicle, now and for good. May be called from any thread."""
+    def resume(self) -> bool:
+        """Arm again after a stop for being late, once everything comes in time and the vehicle has
+        heard the stop; return whether that was so."""
+        with self._lock:
+            now_ns = self._now_ns()
+            beats = list(self._beats.values())
+            if any(now_ns - beat_ns > self._timeout_ns for beat_ns, _ in beats):
+                return False
+            if not self.pauses or self.unheard is not None or self._closed.is_set():
+                return False
+            if isinstance(self._vehicle, Resuming) and not self._vehicle.resume():
+                return False
+            self.reason, self.late = None, False
+            self._tripped.clear()
+            self._written_ns, self._deadline_ns = now_ns, now_ns + self._timeout_ns
+            self._armed = True
+            return True
+
+    def trip(self, reason: str, late: bool = False) -> None:
+        """Stop the vehicle, now and for good. May be called from any thread.
+
+        Args:
+            late: something did not come in time: see `resume`.
+        """
         # A thread that hangs inside the driver holds the lock: then stop without it.
         held = self._lock.acquire(timeout=_LOCK_S)
         try:
-            if self.reason is None:
-                self.reason = reason
+            if self.reason is None or (self.pauses and not late):
+                self.reason, self.late = reason, late
             self._armed = False
             self._tripped.set()
             self._stop()
@@ -187,16 +226,23 @@ class Guard:
     def _look(self) -> None:
         if self.tripped:
             if self.unheard is not None or time.monotonic() - self._stopped_s > _AGAIN_S:
-                self._stop()
+                held = self._lock.acquire(timeout=_LOCK_S)
+                try:
+                    if self.tripped:  # and has not resumed meanwhile
+                        self._stop()
+                finally:
+                    if held:
+                        self._lock.release()
             return
         if not self._armed:
             return
         now_ns = self._now_ns()
         if now_ns > self._deadline_ns:
-            self.trip(f"no fresh command for {(now_ns - self._written_ns) / 1e9:.2f} s")
+            self.trip(f"no fresh command for {(now_ns - self._written_ns) / 1e9:.2f} s", late=True)
         for name, (beat_ns, ident) in list(self._beats.items()):
             if now_ns - beat_ns > self._timeout_ns:
-                self.trip(f"{name} hangs for {(now_ns - beat_ns) / 1e9:.2f} s{_where(ident)}")
+                silent_s = (now_ns - beat_ns) / 1e9
+                self.trip(f"{name} hangs for {silent_s:.2f} s{_where(ident)}", late=True)
 
     def _stop(self) -> None:
         """Tell the vehicle to stop once; `_look` and `close` repeat it until it is heard."""

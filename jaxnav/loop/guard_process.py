@@ -23,6 +23,7 @@ import socket
 import struct
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -57,6 +58,7 @@ HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle 
 _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
 _PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
 _LARGEST = 2**24
+_LOOK_S = 0.02
 
 
 def command_frame(sequence: int, deadline_ns: int, command: Command) -> bytes:
@@ -170,7 +172,7 @@ def main(commands: int, readings: int) -> None:
             factory = _factory(order["vehicle"], order["path"])
             link.tell(ready=True)
             order = {**order, **link.mapping()}
-            vehicle = _opened(factory, order)
+            vehicle = opened(factory, order)
         except CanNotMoveError as problem:
             link.tell(stays=str(problem))
             return
@@ -186,6 +188,7 @@ def main(commands: int, readings: int) -> None:
             limits_from(order["limits"]),
             order["timeout_s"],
             corrections=Corrections(**order["corrections"]),
+            resumes=order["resumes"],
         )
         threading.Thread(target=_report, args=(guard, link), daemon=True).start()
         try:
@@ -231,7 +234,9 @@ class _Server:
         if frame[:1] != KIND_COMMAND:
             said = json.loads(frame[1:])
             if "stop" in said:
-                self._guard.trip(said["stop"])
+                self._guard.trip(said["stop"], said["late"])
+            if "resume" in said and not self._guard.resume():
+                self._link.tell(tripped=self._guard.reason or "it does not resume", late=False)
             return "close" not in said
         sequence, deadline_ns, command = command_of(frame)
         if sequence > self._sequence:
@@ -260,10 +265,13 @@ class _Server:
 
 
 def _report(guard: Guard, link: Link) -> None:
-    """Report a trip at once: in a thread, since the main one may hang in the driver."""
-    guard.wait()
-    with suppress(OSError):
-        link.tell(tripped=guard.reason)
+    """Report each trip at once: in a thread, since the main one may hang in the driver."""
+    while True:
+        guard.wait()
+        with suppress(OSError):
+            link.tell(tripped=guard.reason, late=guard.late)
+        while guard.tripped:  # until it resumes
+            time.sleep(_LOOK_S)
 
 
 def _factory(name: str, path: list[str]) -> Any:
@@ -276,7 +284,17 @@ def _factory(name: str, path: list[str]) -> Any:
     return factory
 
 
-def _opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
+def opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
+    """Open a vehicle without the computing process.
+
+    Args:
+        order: the name under `vehicle`; under `setup` the numbers of its file, and what else
+            `Setup` has.
+
+    Raises:
+        BadInput: as `plugins.open_vehicle`.
+        CanNotMoveError: it needs that process.
+    """
     received: Any = order["setup"]
     missing: Any = _Missing
     numbers: Any = SimpleNamespace(**received["vehicle"])

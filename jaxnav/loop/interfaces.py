@@ -10,7 +10,7 @@ A car is a `Vehicle`. A base that is driven by a twist (`base:` in its file) is 
 which differs in the numbers that it reads and is told. Either may have a gyro, see `HasGyro`.
 
 `jaxnav.testing.check_vehicle` and `check_cameras` test whether a plug-in keeps these promises. A
-vehicle may also be `Ending`, and its factory may be `HasOwnFiles` or `SharesProcess`.
+vehicle may also be `Ending` or `HasTime`, and its factory may be `HasOwnFiles` or `SharesProcess`.
 
 `jaxnav run` opens a vehicle in the process of its guard, which survives any end of the computing
 process (see `guard_process`). There `setup.vehicle` is plain numbers, `setup.rig` and
@@ -32,6 +32,7 @@ if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has
 
     from jaxnav.detection.types import Detections
     from jaxnav.files import Route
+    from jaxnav.loop.standing_clock import WaitingClock
     from jaxnav.models.bicycle import Vehicle as VehicleModel
     from jaxnav.models.markers import MarkerMap
     from jaxnav.models.rig import CameraRig
@@ -212,6 +213,23 @@ class Ending(Protocol):
     @property
     def over(self) -> str | None:
         """Why the drive is over, which ends the loop in good order; None while it goes on."""
+        ...
+
+
+@runtime_checkable
+class HasTime(Protocol):
+    """Optional part of a simulated vehicle in the computing process: the clock of its stamps, and
+    of its cameras', which waits for a drive on a busy computer; all deadlines are on it then."""
+
+    waiting_clock: WaitingClock
+
+
+@runtime_checkable
+class Resuming(Protocol):
+    """Optional part of a vehicle that has a guard of its own, in another process."""
+
+    def resume(self) -> bool:
+        """Ask that guard to arm again; return whether it was asked. It may refuse."""
         ...
 
 

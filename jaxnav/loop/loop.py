@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxnav.loop.expectation import Expectation
-from jaxnav.loop.flags import Fault
+from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import (
@@ -37,6 +37,7 @@ from jaxnav.loop.standing_clock import StandingClock
 
 _THREAD = "the loop"
 _STAYS_S = 0.5  # the drive ends this long after the last waypoint is reached
+_WELL_S = 2.0  # of health OK without a break, before a vehicle that the guard holds drives on
 
 
 class Observer(Protocol):
@@ -87,6 +88,7 @@ class Loop:
 
     Attributes:
         stopped: whether the guard ended the drive.
+        late: whether it did because something did not come in time.
     """
 
     def __init__(
@@ -98,15 +100,19 @@ class Loop:
         observers: Sequence[Observer] = (),
         period_s: float = 0.02,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        say: Callable[[str], object] = lambda text: None,
     ):
         """Args:
         pilot: must be warmed up.
         guard: of the vehicle; `run` arms it.
         eyes: not started yet.
         period_s: time between two readings of the odometer.
+        say: takes a line for a person where the guard holds the vehicle, and lets it go.
         """
         self.pilot, self.guard, self.statistics = pilot, guard, Statistics()
-        self.stopped = False
+        self.stopped = self.late = False
+        self._say, self._held = say, False
+        self._well_ns: int | None = None  # since when all is well, of a vehicle that is held
         self._vehicle, self._eyes, self._observers = vehicle, eyes, list(observers)
         self._period_ns = int(period_s * 1e9)
         self._now_ns, self._clock = now_ns, StandingClock()
@@ -137,7 +143,7 @@ class Loop:
         arrived_ns: int | None = None
         self.guard.arm()
         self.guard.beat(_THREAD)
-        while not self.guard.tripped:
+        while not self.guard.tripped or self._waits():
             now_ns = self._now_ns()
             if self._clock.stands(now_ns):
                 self._hold()
@@ -147,6 +153,8 @@ class Loop:
                 self._tick_if_due()  # frames that have waited must not keep the odometer waiting
             self.guard.beat(_THREAD)
             if (now_ns - begin_ns) / 1e9 > duration_s:
+                if self.guard.tripped:
+                    break
                 return "time is over"
             if ending is not None and (why := ending.over) is not None:
                 return why
@@ -155,8 +163,26 @@ class Loop:
                 if now_ns - arrived_ns > _STAYS_S * 1e9:
                     return "arrived"
             self._eyes.wait((self._due_ns - self._now_ns()) / 1e9)
-        self.stopped = True
+        self.stopped, self.late = True, self.guard.late
         return self.guard.reason or "stopped"
+
+    def _waits(self) -> bool:
+        """Whether the guard, which has tripped, may let the vehicle drive on; let it where all has
+        been well for a while."""
+        if not self.guard.pauses:
+            return False
+        now_ns, outcome = self._now_ns(), self._outcome
+        if not self._held:
+            self._held, self._well_ns = True, None
+            self._say(f"held: {self.guard.reason}")
+        if outcome is None or outcome.health is not Health.OK:
+            self._well_ns = None
+        elif self._well_ns is None:
+            self._well_ns = now_ns
+        elif (now_ns - self._well_ns) / 1e9 > _WELL_S and self.guard.resume():
+            self._held = False
+            self._say(f"drives on: all was well for {_WELL_S:g} s")
+        return True
 
     def _hold(self) -> None:
         """Command no speed while the clock stands: no input comes, and the guard waits for none."""
@@ -224,7 +250,7 @@ class Loop:
             observer.on_outcome(given, outcome)
 
     def _failures(self) -> Fault:
-        faults = Fault(0)
+        faults = Fault.HELD if self.guard.pauses else Fault(0)
         for observer in self._observers:
             faults |= observer.faults
         return faults

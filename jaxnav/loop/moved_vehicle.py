@@ -92,12 +92,14 @@ class GuardProcess:
         limits: CommandLimits,
         timeout_s: float,
         check: Callable[[], None] = lambda: None,
+        resumes: bool = False,
     ) -> MovedVehicle | None:
         """Open the vehicle there; None: it can't be moved after all, see `stays`.
 
         Args:
             timeout_s: time from the last command until the vehicle has been stopped.
             check: called during the wait; may raise.
+            resumes: see `Guard`.
 
         Raises:
             BadInput: as `plugins.open_vehicle`.
@@ -119,6 +121,7 @@ class GuardProcess:
             "limits": asdict(limits),  # type: ignore[call-overload]
             "corrections": asdict(Corrections.of(setup.vehicle)),
             "timeout_s": timeout_s,
+            "resumes": resumes,
         }
         self._order |= changes
         self._opens = True
@@ -184,7 +187,8 @@ class MovedVehicle:
         self._closing = self._closed = False
         self._dead: str | None = None
         self._unheard: str | None = None
-        self._report: Callable[[str], None] = lambda reason: None
+        self._report: Callable[[str, bool], None] = lambda reason, late: None
+        self._late: Callable[[], bool] = lambda: False
         self._ended = threading.Event()
         guarding.readings.socket.settimeout(_READ_S)
         self._thread = threading.Thread(target=self._listen, name="jaxnav-events", daemon=True)
@@ -204,9 +208,16 @@ class MovedVehicle:
         """See `Ending`; as sent with the vehicle's last reading."""
         return self._over
 
-    def watch(self, report: Callable[[str], None]) -> None:
-        """Call this with the reason when the guard there has stopped the vehicle, or has died."""
-        self._report = report
+    def watch(
+        self, report: Callable[[str, bool], None], late: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Call this when the guard there has stopped the vehicle, or has died.
+
+        Args:
+            report: takes the reason, and whether it is that something was late.
+            late: whether the guard here stops it for that reason alone.
+        """
+        self._report, self._late = report, late
         self._thread.start()
 
     def read(self) -> Any:
@@ -269,7 +280,15 @@ class MovedVehicle:
         if self._dead:
             raise OSError(self._dead)
         with suppress(OSError):  # the process is ending: it stops the vehicle by itself
-            self._guarding.commands.tell(stop="told to stop")
+            self._guarding.commands.tell(stop="told to stop", late=self._late())
+
+    def resume(self) -> bool:
+        """See `Resuming`: a refusal is reported as another stop."""
+        with suppress(OSError):
+            if not (self._dead or self._closed):
+                self._guarding.commands.tell(resume=True)
+                return True
+        return False
 
     def close(self) -> None:
         """See `Vehicle`. Waits until the vehicle has heard the stop."""
@@ -299,7 +318,7 @@ class MovedVehicle:
             while True:
                 said = link.mapping()
                 if "tripped" in said:
-                    self._report(said["tripped"])
+                    self._report(said["tripped"], said["late"])
                 if "closed" in said:
                     self._unheard = said["unheard"]
         except (EOFError, OSError, ValueError):
@@ -309,7 +328,7 @@ class MovedVehicle:
         if not self._closing or self._guarding.process.returncode:
             how = f"the guard's process {ending(self._guarding.process)}"
             self._dead = self._unheard = how
-            self._report(how)
+            self._report(how, False)
             if self._guarding.rescue():
                 self._dead = self._unheard = None
                 self._closed = True

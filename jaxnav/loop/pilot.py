@@ -308,7 +308,8 @@ class Pilot:
         if self._gyro is not None and self._age_s(self._gyro.newest_ns, now_ns) > GYRO_STALE_S:
             faults |= Fault.GYRO_STALE
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
-        command = self._limited(known, health, now_ns, elapsed_ns)
+        factor = 0.0 if Fault.HELD in faults else SPEED_FACTOR[health]
+        command = self._limited(known, factor, now_ns, elapsed_ns)
         steering_rad, throttle = command if len(command) == 2 else (0.0, 0.0)
         return Outcome(
             now_ns,
@@ -387,9 +388,9 @@ class Pilot:
         )
         return honest, known._replace(pose_covariance=covariances[0])
 
-    def _limited(self, known: _Known, health: Health, now_ns: int, elapsed_ns: int) -> Command:
+    def _limited(self, known: _Known, factor: float, now_ns: int, elapsed_ns: int) -> Command:
         if self._drives:
-            wanted = self.limits.slowed(known.command, SPEED_FACTOR[health])
+            wanted = self.limits.slowed(known.command, factor)
             self._command = self.limits.within(wanted, self._command, elapsed_ns / 1e9)
         self._commanded_ns = now_ns
         self._standstill.add_command(self._chassis.wanted_mps(self._command), now_ns)

@@ -28,6 +28,7 @@ from mcap.stream_reader import StreamReader
 
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
+from jaxnav.files.reading import open_file
 from jaxnav.files.unpacking import Budget, unpack_chunk
 
 _MAGIC = b"\x89MCAP0\r\n"
@@ -38,9 +39,9 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log and publish time
 def profile_of(path: Path) -> str | None:
     """The profile in the header of an MCAP file; None: it can't be read, or is not MCAP."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(100)
-    except (OSError, ValueError):  # ValueError: a NUL in the name
+    except (OSError, BadInput):
         return None
     # After the magic: a record of type 1, its length in 8 bytes, the profile's length in 4.
     if not head.startswith(_MAGIC + b"\x01") or len(head) < 21:
@@ -81,16 +82,15 @@ class McapMessages:
         self._messages = 0
 
     def __iter__(self) -> Iterator[Metadata | RecordedMessage]:
+        file = open_file(self.path)
         try:
-            with self.path.open("rb") as file:
+            with file:
                 yield from self._read(file)
         except _CutOff as cut:
             if not cut.begun:
                 raise BadInput(self.path, "is not an MCAP file") from None
         except InvalidMagic:
             raise BadInput(self.path, "is not an MCAP file, or its end is damaged") from None
-        except IsADirectoryError:
-            raise BadInput(self.path, "is a folder, not a file") from None
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise BadInput(self.path, f"can't be read: {reason}") from None

@@ -7,6 +7,7 @@ A store belongs to one config and to one set of versions; others are refused.
 import glob
 import json
 import math
+import os
 import secrets
 import shutil
 import warnings
@@ -24,6 +25,7 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.errors import ZarrUserWarning
 
 from jaxnav.errors import BadInput
+from jaxnav.files.reading import check_regular
 from jaxnav.studies.config import difference
 from jaxnav.studies.damage import check_layout, check_sizes, layout_of, reading
 from jaxnav.studies.layout import BoxLayout
@@ -180,6 +182,9 @@ def count_done(path: Path) -> int:
 def _open_group(path: Path, mode: Any) -> zarr.Group:
     if not path.exists():
         raise BadInput(path, "doesn't exist")
+    for folder, _, files in os.walk(path):
+        for file in files:
+            check_regular(Path(folder, file))
     try:
         with warnings.catch_warnings(action="ignore", category=ZarrUserWarning):
             group = zarr.open_group(path, mode=mode)

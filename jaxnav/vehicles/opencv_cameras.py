@@ -127,7 +127,9 @@ class _Capture:
     def _open(self) -> None:
         self.release()
         source, backend = self._opened_with
-        capture = open_video(str(source)) if self._is_file else cv2.VideoCapture(source, backend)
+        capture = (
+            open_video(Path(str(source))) if self._is_file else cv2.VideoCapture(source, backend)
+        )
         if not capture.isOpened():
             capture.release()
             raise OSError(f"{self._source} can't be opened")

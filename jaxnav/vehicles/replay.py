@@ -11,7 +11,6 @@ its JPEGs if `images` is true.
 
 import contextlib
 import threading
-import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -34,6 +33,7 @@ from jaxnav.loop.interfaces import (
     Reading,
     Setup,
 )
+from jaxnav.loop.standing_clock import WaitingClock
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_log import DriveLog, read_drive
 from jaxnav.recording.drive_replay import check_inputs, recorded_pixels
@@ -47,11 +47,12 @@ _LINGERS_NS = 50_000_000  # time after the last input for the search of its mark
 class Clock:
     """The clock of a recording, which starts when it is first read. Thread-safe."""
 
-    def __init__(self, begin_ns: int):
+    def __init__(self, begin_ns: int, present: WaitingClock):
         """Args:
         begin_ns: begin of the recording, on its own clock.
+        present: the time of the drive.
         """
-        self._begin_ns = begin_ns
+        self._begin_ns, self._present = begin_ns, present
         self._shift_ns: int | None = None
         self._lock = threading.Lock()
 
@@ -63,7 +64,7 @@ class Clock:
     def recorded_ns(self) -> int:
         """The present time on the recording's clock."""
         shift_ns = self._shift()
-        return time.monotonic_ns() - shift_ns
+        return self._present.now_ns() - shift_ns
 
     def present_ns(self, stamp_ns: int) -> int:
         """A recorded stamp on the present clock; a stamp that is not positive stays as it is."""
@@ -72,7 +73,7 @@ class Clock:
     def _shift(self) -> int:
         with self._lock:
             if self._shift_ns is None:
-                self._shift_ns = time.monotonic_ns() - self._begin_ns
+                self._shift_ns = self._present.now_ns() - self._begin_ns
             return self._shift_ns
 
 
@@ -82,6 +83,7 @@ class ReplayVehicle:
     Attributes:
         recorded: the recording.
         camera_names: names of its cameras, in the order of its rig.
+        waiting_clock: see `HasTime`.
         clock: the clock of the vehicle and its cameras.
         writes: number of commands written.
         throttle: of the last command, or the largest part of a twist; 0 after a stop.
@@ -98,7 +100,8 @@ class ReplayVehicle:
         """
         self.recorded, own = _recorded(setup.options)
         self.camera_names = own.rig.names
-        self.clock = Clock(self.recorded.inputs[0].now_ns)
+        self.waiting_clock = WaitingClock()
+        self.clock = Clock(self.recorded.inputs[0].now_ns, self.waiting_clock)
         self.writes, self.throttle = 0, 0.0
         self._end_ns = self.recorded.inputs[-1].now_ns + _LINGERS_NS
         # The time of each read of the vehicle, and its reading; None: the read failed.
@@ -190,11 +193,13 @@ class ReplayCamera:
 
     def read(self, timeout_s: float) -> Frame | None:
         """See `Camera`. A frame that could not be used has no image."""
-        left_s = np.inf
+        left_s, due_ns = np.inf, 0
         if self._next < len(self._frames):
             due_ns, sighted = self._frames[self._next]
             left_s = max(due_ns - self._clock.recorded_ns(), 0) / 1e9
         if self._closed.wait(min(left_s, timeout_s)) or left_s > timeout_s:
+            return None
+        if self._clock.recorded_ns() < due_ns:  # it waits for who is behind
             return None
         self._next += 1
         stamp_ns = self._clock.present_ns(sighted.stamp_ns)

@@ -13,13 +13,25 @@ import numpy as np
 
 from jaxnav.errors import BadInput
 from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.interfaces import AnyVehicle, Camera, Frame, GyroReading, Odometry, Setup
+from jaxnav.loop.interfaces import (
+    AnyVehicle,
+    Camera,
+    Frame,
+    GyroReading,
+    HasTime,
+    Odometry,
+    Setup,
+)
 from jaxnav.loop.limits import limits_of
+from jaxnav.loop.standing_clock import WaitingClock
 from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import SimWorld, WorldSettings
 
 _LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are known
+# The clock waits for frames that are later than this: a camera is stale after 0.2 s, and a process
+# that renders on a core of its own takes 0.05 to 0.1 s, without which the simulation is slow.
+_LATE_S = 0.12
 
 
 class SimVehicle:
@@ -31,6 +43,7 @@ class SimVehicle:
     def __init__(self, world: SimWorld):
         """Take the world, which the cameras look at too."""
         self.world, self.timeout_s = world, world.settings.vehicle_timeout_s
+        self.waiting_clock = WaitingClock()
         self._corrections = Corrections.of(world.vehicle)
         self._closed = False
 
@@ -38,7 +51,7 @@ class SimVehicle:
         """See `Vehicle` and `TwistVehicle`."""
         if self._closed:
             raise OSError("the vehicle is closed")
-        reading = self.world.reading(time.monotonic_ns())
+        reading = self.world.reading(self.waiting_clock.now_ns())
         if not isinstance(reading, Odometry):
             return reading
         stamp_ns = reading.stamp_ns + self._corrections.reading_late_ns
@@ -46,7 +59,7 @@ class SimVehicle:
 
     def read_gyro(self) -> tuple[GyroReading, ...]:
         """See `HasGyro`."""
-        return self.world.gyro(time.monotonic_ns())
+        return self.world.gyro(self.waiting_clock.now_ns())
 
     def write(self, *command: float) -> None:
         """See `Vehicle` and `TwistVehicle`."""
@@ -54,11 +67,11 @@ class SimVehicle:
             raise OSError("the vehicle is closed")
         if len(command) == 2:
             command = self._corrections.true_rad(command[0]), command[1]
-        self.world.write(*command, time.monotonic_ns())
+        self.world.write(*command, self.waiting_clock.now_ns())
 
     def stop(self) -> None:
         """See `Vehicle` and `TwistVehicle`."""
-        self.world.write(*limits_of(self.world.vehicle).zero, time.monotonic_ns())
+        self.world.write(*limits_of(self.world.vehicle).zero, self.waiting_clock.now_ns())
 
     def close(self) -> None:
         """See `Vehicle`."""
@@ -69,14 +82,22 @@ class SimVehicle:
 class _Shutter:
     """A thread that makes the frames of all cameras, all exposed at once."""
 
-    def __init__(self, world: SimWorld, rate_hz: float, renderer: RenderingProcess | None):
-        self._world, self._renderer = world, renderer
+    def __init__(
+        self,
+        world: SimWorld,
+        clock: WaitingClock,
+        rate_hz: float,
+        renderer: RenderingProcess | None,
+    ):
+        self._world, self._clock, self._renderer = world, clock, renderer
         self._period_ns = int(1e9 / rate_hz)
         self._late_ns = Corrections.of(world.vehicle).frame_late_ns
         self._news = threading.Condition()
         self._frames: list[Frame] = []
         self._closed = False
         self._error: str | None = None
+        self._due_ns: int | None = None  # when the frames that are made now will have come
+        clock.wait_for(lambda: self._due_ns, _LATE_S)
         self._thread = threading.Thread(target=self._run, name="jaxnav-sim-shutter", daemon=True)
         self._thread.start()
 
@@ -101,20 +122,24 @@ class _Shutter:
         return bool(self._frames) and self._frames[0].stamp_ns > than_ns
 
     def _run(self) -> None:
-        stamp_ns = time.monotonic_ns()
-        while not self._closed:
-            now_ns = time.monotonic_ns()
-            time.sleep(max(stamp_ns + _LATENCY_NS - now_ns, 0) / 1e9)
-            try:
+        clock, stamp_ns = self._clock, self._clock.now_ns()
+        try:
+            while not self._closed:
+                due_ns = stamp_ns + _LATENCY_NS
+                while (left_ns := due_ns - clock.now_ns()) > 0 and not self._closed:
+                    time.sleep(left_ns / 1e9)
+                self._due_ns = due_ns
                 frames = self._looked(stamp_ns)
-            except OSError as error:
-                self._error = None if self._closed else str(error)
-                return
-            with self._news:
-                self._frames = frames
-                self._news.notify_all()
-            behind = max(time.monotonic_ns() - stamp_ns - _LATENCY_NS, 0) // self._period_ns
-            stamp_ns += (behind + 1) * self._period_ns
+                self._due_ns = None
+                with self._news:
+                    self._frames = frames
+                    self._news.notify_all()
+                behind = max(clock.now_ns() - due_ns, 0) // self._period_ns
+                stamp_ns += (behind + 1) * self._period_ns
+        except OSError as error:
+            self._error = None if self._closed else str(error)
+        finally:
+            self._due_ns = None
 
     def _looked(self, stamp_ns: int) -> list[Frame]:
         if self._renderer is None:
@@ -179,5 +204,6 @@ def open_cameras(setup: Setup, vehicle: AnyVehicle) -> Sequence[Camera]:
     if choice(setup.options, "images", ("false", "true")) == "true":
         renderer = RenderingProcess(setup.rig, setup.markers, setup.seed)
     rate_hz = number(setup.options, "rate_hz", 30.0, 1.0, 240.0)
-    shutter = _Shutter(world, rate_hz, renderer)
+    clock = vehicle.waiting_clock if isinstance(vehicle, HasTime) else WaitingClock()
+    shutter = _Shutter(world, clock, rate_hz, renderer)
     return [SimCamera(name, c, shutter) for c, name in enumerate(setup.rig.names)]

@@ -8,6 +8,8 @@ JAXNAV_FUZZ=3000 pytest tests/files/test_fuzz_loaders.py      # number of exampl
 import dataclasses
 import json
 import os
+import signal
+import socket
 import tempfile
 import time
 import zlib
@@ -116,6 +118,36 @@ def test_bytes_of_a_file_that_change_are_noticed_or_do_not_matter(name, folder):
         told(loader, path, folder)
 
     check()
+
+
+@pytest.mark.parametrize("name", [*STRUCTURED, *BINARY])
+def test_only_regular_files_are_read(name, folder, monkeypatch):
+    """A pipe whose other end nobody opens, a device that never ends: neither is waited for."""
+    loader = (STRUCTURED | BINARY)[name]
+    path = loader.make(folder)
+    path.unlink()
+    monkeypatch.chdir(path.parent)  # the path of a socket must be short
+    signal.signal(signal.SIGALRM, hangs)
+    with socket.socket(socket.AF_UNIX) as end:
+        for put in (
+            lambda: os.mkfifo(path),
+            lambda: path.symlink_to("/dev/zero"),
+            lambda: end.bind(path.name),
+        ):
+            put()
+            signal.alarm(20)
+            line = told(loader, path, folder)
+            signal.alarm(0)
+            assert line == f"{path}: is a device, a pipe or a socket: only regular files are read"
+            path.unlink()
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    path.mkdir()  # which a recording may be: then it lacks what it must hold
+    # A box of a store whose file is missing is one that is not done.
+    assert told(loader, path, folder) is not None or "/c/" in name
+
+
+def hangs(number: int, frame: Any) -> None:
+    raise TimeoutError("it is waited for")
 
 
 @pytest.mark.parametrize("name", STRUCTURED)

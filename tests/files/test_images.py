@@ -3,6 +3,7 @@
 import builtins
 import importlib.util
 import io
+import os
 import struct
 from pathlib import Path
 
@@ -74,7 +75,7 @@ def test_frames_of_a_video_come_as_the_sensor_stored_them(quarters: int, tmp_pat
     file.write_bytes(raw)
     turned = cv2.VideoCapture(str(file)).read()[1]
     assert (turned.shape[0] > turned.shape[1]) == (quarters % 2 == 1)  # OpenCV's own way
-    got, image = open_video(str(file)).read()
+    got, image = open_video(file).read()
     assert got
     assert image.shape == frame.shape
     assert np.abs(image.astype(int) - frame).mean() < 8
@@ -149,3 +150,9 @@ def test_what_is_no_picture_is_said_to_be_none(tmp_path: Path) -> None:
         with pytest.raises(BadInput, match=name):
             read_image(tmp_path / name)
         assert exif_orientation(raw) == 1
+
+
+def test_a_video_is_a_regular_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "drive.mp4")
+    with pytest.raises(BadInput, match=r"drive\.mp4: is a device, a pipe or a socket"):
+        open_video(tmp_path / "drive.mp4")

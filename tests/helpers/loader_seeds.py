@@ -301,6 +301,7 @@ turn_limit_radps: 4.0
 time_constant_s: 0.15
 sigma: {speed_scale: 0.01, turn_gain: 0.02}
 gyro: {class: tactical, delay_s: 0.004}
+resume: true
 """
 ROS_BODY = """
 rig: rig.yaml

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from jaxnav.loop.guard import TIMEOUT_S, Guard
 from jaxnav.loop.limits import Limits
+from jaxnav.loop.standing_clock import WaitingClock
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
 SLACK_S = 0.15  # of a machine that does something else
@@ -109,6 +110,103 @@ def test_it_does_not_arm_again(car, guard):
     assert not guard.write(0.1, 0.2)
     assert car.told[-1][2] == 0
     assert guard.reason == "told to"
+
+
+@pytest.fixture
+def resuming(car):
+    guard = Guard(car, LIMITS, resumes=True)
+    guard.arm()
+    drive(guard, 0.05)
+    yield guard
+    car.let_go.set()
+    guard.close()
+
+
+def test_where_the_file_allows_it_the_vehicle_drives_on_after_a_stop_for_being_late(car, resuming):
+    for _ in range(2):
+        since = len(car.told)
+        assert resuming.wait(1.0)
+        assert resuming.pauses
+        assert "no fresh command" in resuming.reason
+        assert not resuming.write(0.1, 0.2)
+        time.sleep(0.3)  # it repeats the stop meanwhile, and not after
+        assert {throttle for _, _, throttle in car.told[since:]} == {0.0}
+        assert resuming.resume()
+        assert not resuming.tripped
+        since = len(car.told)
+        drive(resuming, 0.3)
+        assert {throttle for _, _, throttle in car.told[since:]} == {0.2}
+
+
+def test_without_that_word_it_does_not_resume(car, guard):
+    guard.arm()
+    drive(guard, 0.05)
+    assert guard.wait(1.0)
+    assert guard.late
+    assert not guard.pauses
+    assert not guard.resume()
+    assert not guard.write(0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        (lambda guard, car: guard.trip("SIGINT"), "SIGINT"),
+        (lambda guard, car: guard.write(math.nan, 0.2), "the command was no number: nan, 0.2"),
+        (lambda guard, car: guard.close(), "closed"),
+    ],
+)
+@pytest.mark.parametrize("paused", [True, False])
+def test_what_is_not_late_is_for_good(car, resuming, what, reason, paused):
+    if paused:
+        assert resuming.wait(1.0)
+    what(resuming, car)
+    assert resuming.tripped
+    assert not resuming.pauses
+    assert not resuming.resume()
+    assert not resuming.write(0.1, 0.2)
+    assert resuming.reason == reason
+    assert car.told[-1][2] == 0
+
+
+def test_it_does_not_resume_before_a_thread_is_back_and_the_stop_was_heard(car, resuming):
+    resuming.beat("camera")
+    drive(resuming, 0.3)
+    assert not resuming.resume()
+    resuming.beat("camera")
+    car.fails = 10**6
+    time.sleep(0.15)
+    resuming.beat("camera")
+    assert resuming.unheard is not None
+    assert not resuming.resume()
+    car.fails = 0
+    time.sleep(0.15)
+    resuming.beat("camera")
+    assert resuming.resume()
+
+
+def test_the_clock_of_a_simulation_waits_for_who_is_behind(car):
+    clock = WaitingClock()
+    guard = Guard(car, LIMITS, now_ns=clock.now_ns)
+    clock.wait_for(guard.oldest_sign_ns, 0.08)
+    for _ in range(2):
+        assert abs(clock.now_ns() - time.monotonic_ns()) < 50_000_000  # nobody is behind yet
+    guard.arm()
+    guard.beat("camera")
+    begin_ns = clock.now_ns()
+    drive(guard, 0.6)  # and no sign of the camera
+    assert not guard.tripped
+    times_ns = [clock.now_ns() for _ in range(3)]
+    assert times_ns == sorted(set(times_ns))
+    assert 70_000_000 < times_ns[-1] - begin_ns < 81_000_000
+    guard.beat("camera")
+    drive(guard, 0.03)
+    assert 100_000_000 < clock.now_ns() - begin_ns < 165_000_000
+    guard.trip("told to")
+    after_ns = clock.now_ns()
+    time.sleep(0.3)
+    assert clock.now_ns() - after_ns >= 300_000_000  # what has stopped is not waited for
+    guard.close()
 
 
 @pytest.mark.parametrize(
@@ -254,6 +352,7 @@ import math, signal, sys, threading, time
 sys.path.insert(0, {root!r})
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.limits import Limits
+from jaxnav.loop.standing_clock import WaitingClock
 from jaxnav.loop.signals import Signals
 
 class Car:

@@ -40,13 +40,18 @@ def closing_of(guarding):
 class Drive:
     """A car behind a guard's process, from this one."""
 
-    def __init__(self, folder, **options):
+    def __init__(self, folder, here=False, there=False, **options):
+        """Args:
+        here, there: whether the guards may resume.
+        """
         self.log = folder / "log"
         self.guarding = GuardProcess(plain_car.NAME)
         self.guarding.prepare(lambda: None)
-        self.vehicle = self.guarding.open(make_setup(log=self.log, **options), LIMITS, 0.2)
-        self.guard = Guard(self.vehicle, LIMITS)
-        self.vehicle.watch(self.guard.trip)
+        self.vehicle = self.guarding.open(
+            make_setup(log=self.log, **options), LIMITS, 0.2, resumes=there
+        )
+        self.guard = Guard(self.vehicle, LIMITS, resumes=here)
+        self.vehicle.watch(self.guard.trip, lambda: self.guard.late)
         self.guard.arm()
 
     def drive(self, duration_s=0.2):
@@ -104,6 +109,63 @@ def test_commands_that_stop_coming_stop_it(drive):
     assert "no fresh command" in drive.guard.reason
     wait_for(lambda: words(drive.log)[-1].throttle == 0)
     assert (drive.stood_ns() - since_ns) / 1e9 < STOPS_S + SLACK_S
+
+
+@contextmanager
+def held(folder, there=True):
+    """A drive that the guard there, or here, has stopped because something was late."""
+    drive = Drive(folder, here=True, there=there)
+    try:
+        drive.drive()
+        wait_for(lambda: drive.guard.pauses)
+        wait_for(lambda: words(drive.log)[-1].throttle == 0)
+        time.sleep(0.3)  # both guards know of each other's stop by then
+        yield drive
+    finally:
+        drive.guard.close()
+
+
+def test_where_the_file_allows_it_the_vehicle_drives_on_again_and_again(tmp_path):
+    with held(tmp_path) as drive:
+        for _ in range(2):
+            count = len(drive.driven())
+            assert drive.guard.resume()
+            drive.drive(0.5)
+            assert not drive.guard.tripped, drive.guard.reason
+            assert len(drive.driven()) > count + 10
+            wait_for(lambda: drive.guard.pauses)
+            wait_for(lambda: words(drive.log)[-1].throttle == 0)
+            time.sleep(0.3)
+
+
+def assert_stays_stopped(drive):
+    count = len(drive.driven())
+    drive.guard.resume()
+    wait_for(lambda: drive.guard.tripped and not drive.guard.pauses)
+    drive.drive()
+    assert len(drive.driven()) == count
+    assert words(drive.log)[-1].throttle == 0
+
+
+def test_the_guard_there_must_allow_it_as_well(tmp_path):
+    with held(tmp_path, there=False) as drive:
+        assert_stays_stopped(drive)
+
+
+def test_told_to_end_while_it_holds_the_vehicle_it_does_not_let_it_drive_on(tmp_path):
+    with held(tmp_path) as drive:
+        os.kill(drive.vehicle.pid, signal.SIGTERM)
+        time.sleep(0.2)
+        assert_stays_stopped(drive)
+
+
+def test_a_signal_here_while_it_is_held_is_for_good(tmp_path):
+    with held(tmp_path) as drive:
+        drive.guard.trip("SIGINT")
+        time.sleep(0.2)
+        drive.vehicle.resume()  # past the guard of this process
+        assert_stays_stopped(drive)
+        assert drive.guard.reason == "SIGINT"
 
 
 def test_limits_hold_in_the_process_that_writes(drive):

@@ -149,7 +149,7 @@ def test_readings_limits_and_a_gyro_pass_through_the_guards_process(tmp_path):
         limits = TwistLimits(1.0, 0.0, 3.0)
         vehicle = guarding.open(make_setup(log=tmp_path / "log"), limits, 5.0)
         assert vehicle is not None, guarding.stays
-        vehicle.watch(lambda reason: None)
+        vehicle.watch(lambda *why: None)
         assert vehicle.read().values == ZERO
         vehicle.write(9.0, 9.0, -1.5)  # past any guard of this process
         wait_for(lambda: last(tmp_path) == (1.0, 0.0, -1.5))
@@ -178,7 +178,7 @@ def test_a_gyro_that_can_not_be_read_is_no_reason_to_go_without_the_odometer(tmp
         setup = make_setup(log=tmp_path / "log", broken_gyro="yes")
         vehicle = guarding.open(setup, TwistLimits(1.0, 0.0, 3.0), 5.0)
         assert vehicle is not None, guarding.stays
-        vehicle.watch(lambda reason: None)
+        vehicle.watch(lambda *why: None)
         assert vehicle.read().values == ZERO
         assert vehicle.read_gyro() == ()
         vehicle.close()

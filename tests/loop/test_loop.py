@@ -4,6 +4,7 @@ import dataclasses
 import math
 import threading
 import time
+from contextlib import contextmanager
 
 import cv2
 import jax
@@ -13,7 +14,7 @@ import pytest
 from jaxnav.detection import Tracker, make_detector
 from jaxnav.detection.signs_of_life import sign
 from jaxnav.detection.types import Detections
-from jaxnav.loop.flags import Fault
+from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.guard import TIMEOUT_S, Guard
 from jaxnav.loop.interfaces import MOST_TURNS, Frame, GyroReading, Odometry
@@ -117,23 +118,26 @@ def standing() -> Throttle:
 class Drive:
     """A loop that runs in a thread of its own."""
 
-    def __init__(self, pilot, car=None):
-        self.car, self.pilot = car or Car(), pilot
+    def __init__(self, pilot, car=None, resumes=False, lasts_s=3.0):
+        self.car, self.pilot, self.lasts_s = car or Car(), pilot, lasts_s
         pilot.act = lambda: None
         pilot.handled.clear()
         self.cameras = [Eye(name) for name in ("front", "right", "rear", "left")]
         self.looks = [Look() for _ in self.cameras]
-        self.guard = Guard(self.car, pilot.limits)
+        self.guard = Guard(self.car, pilot.limits, resumes=resumes)
         self.eyes = Eyes(self.cameras, self.looks, self.guard)
         self.clock = time.monotonic_ns
         now_ns = lambda: self.clock()  # noqa: E731
-        self.loop = Loop(pilot, self.guard, self.car, self.eyes, now_ns=now_ns)
+        self.said = []
+        self.loop = Loop(
+            pilot, self.guard, self.car, self.eyes, now_ns=now_ns, say=self.said.append
+        )
         self.ended = None
         self.thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self):
         try:
-            self.ended = self.loop.run(3.0)
+            self.ended = self.loop.run(self.lasts_s)
         except Exception as error:
             self.ended = error
         finally:
@@ -159,6 +163,13 @@ class Drive:
             assert time.monotonic() < deadline_s
             time.sleep(0.01)
         assert not self.guard.tripped, self.guard.reason
+
+    def until_driven_on(self):
+        """Wait until a vehicle that is held drives on."""
+        deadline_s = time.monotonic() + 10
+        while self.guard.tripped or self.car.told[-1][1] == 0:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
 
     def stopped_after(self, since):
         """Seconds until the last throttle that was not zero."""
@@ -226,6 +237,69 @@ def test_whoever_hangs_or_fails_the_vehicle_stands_in_time(standing, who, act):
             assert "RuntimeError: somewhere" in said
         if act is hang:
             assert "hangs" in said or "no fresh command" in said
+
+
+@pytest.fixture
+def well(standing, monkeypatch) -> Throttle:
+    """Says that all is well."""
+    outcome = dataclasses.replace(standing.outcome, health=Health.OK)
+    monkeypatch.setattr(standing, "outcome", outcome)
+    return standing
+
+
+@contextmanager
+def held(pilot, resumes=True):
+    """A drive in which a detector took too long, once."""
+    with Drive(pilot, resumes=resumes, lasts_s=60.0) as drive:
+        drive.looks[1].act = lambda: time.sleep(0.6)
+        assert drive.guard.wait(5.0)
+        drive.looks[1].act = lambda: None
+        yield drive
+
+
+def test_a_vehicle_that_may_resume_does_when_all_was_well_for_two_seconds(well):
+    with held(well) as drive:
+        since = time.monotonic()
+        drive.until_driven_on()
+        assert time.monotonic() - since > 2.0
+        assert drive.thread.is_alive()
+        assert drive.said[0].startswith("held: detector ")
+        assert drive.said[1:] == ["drives on: all was well for 2 s"]
+        flags = [Fault.HELD in given.faults for given in drive.pilot.handled]
+        assert flags.count(True) > 50
+        assert [flags[0], flags[-1]] == [False, False]
+
+
+def test_without_that_word_the_drive_is_over(well):
+    with held(well, resumes=False) as drive:
+        drive.thread.join(5)
+        assert " hangs for " in drive.ended
+        assert drive.loop.stopped
+        assert drive.loop.late
+        assert drive.said == []
+
+
+@pytest.mark.parametrize("after_s", [0.0, 1.0])
+def test_a_signal_ends_a_drive_that_is_held(well, after_s):
+    with held(well) as drive:
+        time.sleep(after_s)
+        drive.guard.trip("SIGINT")
+        drive.thread.join(5)
+        assert drive.ended == "SIGINT"
+        assert drive.loop.stopped
+        assert not drive.loop.late
+
+
+def test_a_vehicle_that_is_not_well_or_has_no_number_does_not_resume(well):
+    with held(well) as drive:
+        good = drive.pilot.outcome
+        drive.pilot.outcome = dataclasses.replace(good, health=Health.DEGRADED)
+        time.sleep(3.0)
+        assert drive.guard.pauses
+        drive.pilot.outcome = dataclasses.replace(good, steering_rad=math.nan)
+        drive.thread.join(5)
+        assert drive.ended.startswith("the command was no number")
+        assert not drive.guard.resume()
 
 
 def test_a_search_that_takes_long_and_gives_signs_of_life_does_not_end_the_drive(standing):

@@ -424,3 +424,20 @@ def test_what_nothing_confirms_is_not_decided_and_its_sigma_says_so(setup):
     assert (last.outcome.health, last.outcome.throttle) == (Health.STOP, 0.0)
     wrong = [step for step in steps if step.outcome.output.decided]
     assert max(np.hypot(*(s.outcome.output.pose - s.truth[:3])[:2]) for s in wrong) < 0.2
+
+
+def test_a_vehicle_that_the_guard_holds_is_known_to_stand_and_to_be_well(setup):
+    """Else the throttle that it does not get would be held against its wheels."""
+
+    def hold(given: Input) -> list[Input]:
+        return [dataclasses.replace(given, faults=given.faults | Fault.HELD)]
+
+    steps = simulated(setup, 6.0, change=inject.between(1.5, 5.0, hold))
+    held = [step.outcome for step in steps if Fault.HELD in step.outcome.faults]
+    assert len(held) > 200
+    assert {outcome.throttle for outcome in held} == {0.0}
+    suspicious = Fault.NOTHING_MOVES | Fault.ODOMETRY_STUCK | Fault.ODOMETRY_DOUBTFUL
+    assert not any(outcome.faults & suspicious for outcome in held)
+    assert {outcome.health for outcome in held[len(held) // 2 :]} == {Health.OK}
+    assert steps[-1].outcome.throttle > 0
+    assert steps[-1].outcome.health is Health.OK

@@ -125,7 +125,7 @@ class Now:
 @pytest.fixture
 def now(monkeypatch) -> Now:
     now = Now()
-    monkeypatch.setattr("jaxnav.vehicles.replay.time", now)
+    monkeypatch.setattr("jaxnav.loop.standing_clock.time", now)
     return now
 
 

@@ -247,10 +247,8 @@ def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
     Raises:
         BadInput: OpenCV can't read the file as a video.
     """
-    capture = open_video(str(file))
+    capture = open_video(file)
     try:
-        if not file.is_file():
-            raise BadInput(file, "can't be read: no such file")
         if not capture.isOpened():
             raise BadInput(file, "is not a video that OpenCV can read")
         width, height = map(capture.get, (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

@@ -73,8 +73,9 @@ def _open_vehicle(name: str, setup: Setup, opened: list[AnyVehicle]) -> Iterator
     if not vehicle.timeout_s < math.inf:
         yield warning(
             f"{name} does not stop by itself when nothing is written any more",
-            "a computer that fails as a whole leaves it driving: have a switch at hand that cuts "
-            "its power",
+            "killed together, the processes of a drive leave it driving: let your service manager "
+            f"run `jaxnav stop --car {name}` then; a computer that fails as a whole does too: have "
+            "a switch at hand that cuts its power",
         )
 
 

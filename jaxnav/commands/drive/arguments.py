@@ -110,6 +110,23 @@ class Run(Checked):
 
 
 @dataclass(frozen=True)
+class Stop(Checked):
+    """Tell a vehicle to stop that nobody drives any more.
+
+    For a service manager (`ExecStopPost`), after both processes of `jaxnav run` were killed at
+    once. Says stop for up to 10 s, until the vehicle has heard it.
+
+    Exit codes: 0 it has heard, 1 it has not, 2 bad input.
+    """
+
+    car: str
+    """As `jaxnav run` was told: an installed vehicle, or MODULE:NAME."""
+    option: KeyValues = ()
+    """What the vehicle is told, as by `jaxnav run`."""
+    vehicle: QCarVehicle = None
+
+
+@dataclass(frozen=True)
 class Ros(Checked):
     """Localise and drive as a lifecycle node of ROS 2, named jaxnav.
 

@@ -28,6 +28,7 @@ from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.errors import BadInput
 from jaxnav.files import Route, load_markers, load_params, load_route, load_vehicle
 from jaxnav.files.ros import RosFile
+from jaxnav.files.vehicles import may_resume
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame, Setup
@@ -128,6 +129,7 @@ class PreparedDrive:
             signals,
             until_arrival=False,
             now_ns=self._connection.now_ns,
+            resumes=may_resume(path_of(self.file, "vehicle")),
         )
         run = partial(drive.run, pilot, self._searches, observers)
         return _Driving(drive, run, observers, keeper, self._say)

@@ -4,6 +4,7 @@ Every step of the start checks whether a signal has come, arming above all: see 
 """
 
 import gc
+import math
 import os
 import sys
 import time
@@ -26,10 +27,11 @@ from jaxnav.configuration import step_folder
 from jaxnav.detection import Tracker, make_detectors
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
+from jaxnav.files.vehicles import may_resume
 from jaxnav.loop import plugins
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import AnyVehicle, HasOwnFiles, Setup, SharesProcess
+from jaxnav.loop.interfaces import AnyVehicle, HasOwnFiles, HasTime, Setup, SharesProcess
 from jaxnav.loop.limits import CommandLimits
 from jaxnav.loop.loop import Loop, Observer
 from jaxnav.loop.moved_vehicle import GuardProcess, MovedVehicle
@@ -42,6 +44,13 @@ from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
 EXIT_STOPPED = 1  # by the watchdog, not by a person
+# How far the clock of a simulated vehicle runs ahead of a thread that does not come back: longer
+# than a camera's thread waits (0.05 s), shorter than the odometer takes to be stale (0.1 s).
+_AHEAD_S = 0.08
+UNSTOPPED = (
+    "{car} does not stop by itself when all processes here are killed at once: have `jaxnav stop "
+    "--car {car}` run then, see docs/guide/drive.md, or a switch at hand"
+)
 
 
 @before_others()
@@ -80,7 +89,8 @@ def run(args: Run, signals: Signals) -> int:
         signals.check()
         pilot = compiled_pilot(args, setup, searches)
         signals.check()
-        drive = Drive(args, vehicle_setup, guarding, signals)
+        resumes = args.vehicle is not None and may_resume(args.vehicle)
+        drive = Drive(args, vehicle_setup, guarding, signals, resumes=resumes)
         reason = drive.run(pilot, searches, onlookers)
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
@@ -186,6 +196,7 @@ class Drive:
         signals: Signals,
         until_arrival: bool = True,
         now_ns: Callable[[], int] = time.monotonic_ns,
+        resumes: bool = False,
     ):
         """Open nothing yet.
 
@@ -193,7 +204,9 @@ class Drive:
             guarding: the process for the vehicle; None keeps it in this one.
             until_arrival: whether the last waypoint ends the drive.
             now_ns: the time of the vehicle's and the cameras' stamps.
+            resumes: whether the vehicle's file says so.
         """
+        self._resumes = resumes
         self._args, self._setup, self._guarding, self._signals = args, setup, guarding, signals
         self._until_arrival, self._now_ns = until_arrival, now_ns
 
@@ -208,6 +221,8 @@ class Drive:
             vehicle, guard = self._guarded(pilot.limits)
             self.guard = guard
             closing.callback(self._close, vehicle, guard)
+            if not vehicle.timeout_s < math.inf:
+                _warn(UNSTOPPED.format(car=args.car))
             signals.on_signal(guard.trip)
             signals.check()
             cameras = plugins.open_cameras(args.cameras or args.car, self._setup, vehicle)
@@ -216,7 +231,7 @@ class Drive:
             # The guard trips before the eyes are closed, which their threads may delay.
             closing.callback(guard.trip, "the drive is over")
             self.loop = Loop(
-                pilot, guard, vehicle, self.eyes, onlookers, args.period_s, self._now_ns
+                pilot, guard, vehicle, self.eyes, onlookers, args.period_s, self._now_ns, _warn
             )
             signals.check()
             duration_s = args.duration_s if args.duration_s is not None else float("inf")
@@ -226,10 +241,12 @@ class Drive:
         """The vehicle, in a process of its own where possible, and the guard of this process."""
         args, why = self._args, "it shares its process"
         if self._guarding is not None:
-            moved = self._guarding.open(self._setup, limits, args.timeout_s, self._signals.check)
+            moved = self._guarding.open(
+                self._setup, limits, args.timeout_s, self._signals.check, self._resumes
+            )
             if moved is not None:
-                guard = Guard(moved, limits, args.timeout_s)
-                moved.watch(guard.trip)
+                guard = Guard(moved, limits, args.timeout_s, resumes=self._resumes)
+                moved.watch(guard.trip, lambda: guard.late)
                 self.kept_by = f"a process of its own, {moved.priority}"
                 _say(args, f"guard: {self.kept_by}")
                 return moved, guard
@@ -238,7 +255,13 @@ class Drive:
         _say(args, f"guard: {self.kept_by}")
         vehicle = plugins.open_vehicle(args.car, self._setup)
         corrections = Corrections.of(self._setup.vehicle)
-        return vehicle, Guard(vehicle, limits, args.timeout_s, corrections=corrections)
+        clock = vehicle.waiting_clock if isinstance(vehicle, HasTime) else None
+        now_ns = time.monotonic_ns if clock is None else clock.now_ns
+        guard = Guard(vehicle, limits, args.timeout_s, now_ns, corrections, self._resumes)
+        if clock is not None:
+            self._now_ns = now_ns
+            clock.wait_for(guard.oldest_sign_ns, min(_AHEAD_S, args.timeout_s / 2))
+        return vehicle, guard
 
     def _close(self, vehicle: AnyVehicle, guard: Guard) -> None:
         guard.close()
@@ -250,8 +273,18 @@ def _say(args: Run, text: str) -> None:
         sys.stderr.write(f"{visible(text)}\n")
 
 
+def _warn(text: str) -> None:
+    """Write a line that a person must have read, also where no status line is wanted."""
+    sys.stderr.write(f"{visible(text)}\n")
+
+
 def _summarise(loop: Loop, eyes: Eyes, reason: str) -> None:
     print(f"ended: {reason}")
+    if loop.late:
+        print(
+            "if the computer was busy: run fewer programs and threads beside the drive, raise its "
+            "priority (`jaxnav doctor` says how), or give it more time (--timeout-s)"
+        )
     statistics = loop.statistics
     for name in sorted(statistics.counts):
         median, late = (statistics.quantile_ms(name, share) for share in (0.5, 0.99))

@@ -53,16 +53,16 @@ class Workplace:
         return [sys.executable, "-c", MAIN, "run", *map(str, arguments)]
 
     def driving(self, log: Path, record: Path) -> list[str]:
-        """With a watchdog that is patient with a busy machine, and parameters of its own."""
+        """With parameters of its own."""
         return self.command(
             *("--car", recorded_vehicle.NAME, "--cameras", "sim", "--option", f"log={log}"),
             *("--route", self.folder / "route.yaml", "--record", record),
             *("--params", self.folder / "params.yaml"),
-            *("--headless", "--timeout-s", 3),
+            "--headless",
         )
 
     def moved(self, log: Path, record: Path) -> list[str]:
-        """The same, of a car in the guard's process."""
+        """Of a car in the guard's process, which is patient with a busy machine."""
         return self.command(
             *("--car", plain_car.NAME, "--cameras", plain_cameras.NAME),
             *("--option", f"log={log}", "--route", self.folder / "route.yaml"),
@@ -185,6 +185,17 @@ def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
     assert f"recorded {count} messages in {drive.record}" in ended.out
 
 
+def test_a_simulated_drive_that_was_suspended_goes_on(workplace, tmp_path):
+    """As of a computer that had no core for it: no deadline of the simulation has passed."""
+    with driving(workplace, tmp_path) as drive:
+        for _ in range(2):
+            drive.process.send_signal(signal.SIGSTOP)
+            time.sleep(0.6)
+            drive.process.send_signal(signal.SIGCONT)
+            time.sleep(0.1)
+        assert_arrived(drive.ended())
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
     with driving(workplace, tmp_path) as drive:
@@ -235,6 +246,7 @@ def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_pa
         ended = drive.ended()
     assert ended.code == 1
     assert ended.out.startswith("ended: the guard's process was ended by signal 9\n")
+    assert f"{plain_car.NAME} does not stop by itself when all processes here are" in ended.err
     assert ended.told[-1].throttle == 0  # by another one that was started for it
 
 
