@@ -2,18 +2,19 @@
 
     python -P -m jaxnav.loop.guard_process COMMANDS READINGS SPARE    # file descriptors of sockets
 
-`moved_vehicle` starts it and talks to it. At once it forks another one, the spare, which waits on
-the third socket: should this one hang or die, the spare opens the vehicle and stops it, and all
-that takes is there already, whatever has run out by then. It imports no JAX and no OpenCV, is up in a fifth of a
+`moved_vehicle` starts it and talks to it. It imports no JAX and no OpenCV, is up in a fifth of a
 second, and runs the plug-in behind a `Guard` with its limits and corrections. Each command carries
 the deadline of the next one, on the clock that all processes of a machine share: a command that
 comes too late is not obeyed, and when none comes in time the vehicle is stopped. It is stopped at
 once when the computing process ends, however it ends, since that closes the sockets.
 
 On the first socket JSON and commands come in and events go out; on the second a byte requests a
-reading. All of these are framed, see `Link`. Once it has tripped, it says ten times a second whether
-the vehicle has heard the stop. A driver that does not come back from `stop` silences it, and so does
-one that holds the interpreter.
+reading. All of these are framed, see `Link`. Once it has tripped, it says ten times a second
+whether the vehicle has heard the stop. A driver that holds the interpreter silences it, and so does
+one that does not come back from `stop`.
+
+At once it forks another process, the spare, which waits on the third socket. Where this one hangs
+or dies the spare opens the vehicle and stops it: then nothing that may have run out is needed.
 """
 
 from __future__ import annotations
@@ -327,7 +328,7 @@ def _preferred() -> str:
 
 
 def _forked() -> int | None:
-    """Fork the spare, before there is a thread; its id, 0 in itself, None where there is no room."""
+    """Fork the spare, before there is a thread; return its id, 0 in itself, None without room."""
     with suppress(OSError):
         return os.fork()
     return None

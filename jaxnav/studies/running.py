@@ -140,9 +140,14 @@ def local_cluster(workers: int) -> Iterator["Client"]:
     """A cluster of worker processes on this machine, each with one box at a time."""
     import logging
 
+    import dask
     from distributed import Client, LocalCluster
 
+    # Dask starts workers, also later ones, by `python -c`, which would import from the folder that
+    # it is started in.
+    safe = {"distributed.nanny.pre-spawn-environ.PYTHONSAFEPATH": "1"}
     with (
+        dask.config.set(safe),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
