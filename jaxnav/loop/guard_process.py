@@ -64,7 +64,9 @@ _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
 _PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
 _LARGEST = 2**24
 _SAYS_S = 0.1  # period at which it says whether a stop was heard; `moved_vehicle` waits for five
-_TRIES_S = 1.0  # a `stop` that lasts longer hangs: longer than the timeouts of the buses we know
+# A `stop` that lasts longer counts as no answer. With the longest wait for a command (0.2 s by
+# default) and for an answer (0.5 s) it leaves 0.8 of 2 s for another one to open the vehicle.
+_TRIES_S = 0.5
 
 
 def command_frame(sequence: int, deadline_ns: int, command: Command) -> bytes:
@@ -188,6 +190,7 @@ def main(commands: int, readings: int | None, spare: int | None = None) -> None:
         only_stops = order.get("only_stops", False)  # in the place of one that hung or died
         if only_stops:
             link.tell(received=True)
+            _preferred()  # before the plug-in is imported, as the vehicle may be driving
         try:
             factory = _factory(order["vehicle"], order["path"])
             if not only_stops:

@@ -33,6 +33,7 @@ from jaxnav.loop.guard_process import (
 )
 from jaxnav.loop.interfaces import GyroReading, Setup
 from jaxnav.loop.limits import CommandLimits
+from jaxnav.loop.priority import before_siblings
 
 _MODULE = "jaxnav.loop.guard_process"
 _READ_S = 0.02  # timeout of a reading: a tick of the loop
@@ -59,6 +60,7 @@ class GuardProcess:
 
     Attributes:
         stays: why the vehicle can't be moved; None: it can, or that is not known yet.
+        spare_pid: id of the spare; None: there is none.
     """
 
     def __init__(self, name: str, order: dict[str, Any] | None = None):
@@ -75,7 +77,7 @@ class GuardProcess:
         self.stays: str | None = None
         self._opens = False
         self._order: dict[str, Any] = {"vehicle": name, "path": import_path()} | (order or {})
-        self._spare_pid: int | None = None
+        self.spare_pid: int | None = None
         ours, theirs = zip(*(socket.socketpair() for _ in range(3)), strict=True)
         # OpenBLAS would allocate memory for a thread per core, and all of it would be locked.
         try:
@@ -98,7 +100,7 @@ class GuardProcess:
         """
         if "bad" in (answer := self._answer(check)):  # the caller found it here, so it runs here
             self.stays = f"there {answer['bad']}"
-        self._spare_pid = answer.get("spare")
+        self.spare_pid = answer.get("spare")
 
     def open(
         self,
@@ -159,8 +161,8 @@ class GuardProcess:
                 self.spare.mapping()
                 return _unheard_by(self.spare)
             # It hangs as well: two that hold the vehicle may be one too many.
-            if self._spare_pid:
-                os.kill(self._spare_pid, signal.SIGKILL)
+            if self.spare_pid:
+                os.kill(self.spare_pid, signal.SIGKILL)
         try:
             another = GuardProcess(self.name, order)
         except OSError as error:
@@ -324,8 +326,9 @@ class MovedVehicle:
         """Listen to the guard's process to its end, and put another in its place where it ends
         badly. In a thread of its own, so that nothing else in this process delays it."""
         try:
-            if (how := self._befallen()) is not None:
-                self._replace(how)
+            with before_siblings():
+                if (how := self._befallen()) is not None:
+                    self._replace(how)
         finally:
             self._ended.set()
 

@@ -4,6 +4,7 @@ This process writes every box, wherever it ran. On a cluster Dask carries tasks 
 restarts the tasks of a dead worker, and shows its dashboard.
 """
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -140,14 +141,12 @@ def local_cluster(workers: int) -> Iterator["Client"]:
     """A cluster of worker processes on this machine, each with one box at a time."""
     import logging
 
-    import dask
     from distributed import Client, LocalCluster
 
-    # Dask starts workers, also later ones, by `python -c`, which would import from the folder that
-    # it is started in.
-    safe = {"distributed.nanny.pre-spawn-environ.PYTHONSAFEPATH": "1"}
+    # Dask starts workers, later ones too, and multiprocessing a process of its own, by `python -c`,
+    # which would import from the current folder.
+    os.environ["PYTHONSAFEPATH"] = "1"
     with (
-        dask.config.set(safe),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
