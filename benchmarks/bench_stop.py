@@ -1,7 +1,9 @@
-"""Does the car stop? Deaths of the process that computes, signals at any moment, long driving.
+"""Does the car stop? Deaths of the process that computes, signals at any moment, guards that hang,
+long driving.
 
     python benchmarks/bench_stop.py deaths --each 50 --load 8
     python benchmarks/bench_stop.py signals --count 500
+    python benchmarks/bench_stop.py hangs --each 50 --load 8
     python benchmarks/bench_stop.py soak --minutes 60 --load 8
 
 `--load` adds so many processes that compute. How late a process wakes that only sleeps is measured
@@ -24,6 +26,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +38,7 @@ sys.path.insert(0, str(ROOT))
 from jaxnav.loop.flags import Health  # noqa: E402
 from jaxnav.recording.drive_log import read_drive  # noqa: E402
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle  # noqa: E402
-from tests.helpers.dying_parent import ENDS  # noqa: E402
+from tests.helpers.dying_parent import ENDS, ENDS_WELL  # noqa: E402
 
 MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -252,6 +255,136 @@ def _signalled(
     return kind, phase, stood, process.returncode in expected, max(late_ms, 0.0), detail
 
 
+def hangs(each: int, jobs: int, processes: int, whole: bool) -> None:
+    """A table: a guard that hangs, and up to a second later the drive ends. How long after that the
+    vehicle stands, and whether that was said.
+
+    Args:
+        whole: by `jaxnav run`; else by its signals, guard and vehicle alone, which is soon up.
+    """
+    rows: dict[tuple[str, str], list[float]] = {}
+    missed, wrong, loads = 0, [], []
+    with tempfile.TemporaryDirectory() as made, load(processes), ThreadPoolExecutor(jobs) as pool:
+        folder = Path(made)
+        lasts_s = _drive_lasts_s(folder) if whole else 0.0
+        ends = [*(number.name for number in SIGNALS), "time is over", *["arrived"] * whole]
+        todo = [(how, end) for _ in range(each) for how in ("stopped", "held") for end in ends]
+        one = partial(_hung_run, lasts_s=lasts_s) if whole else _hung
+        results = pool.map(lambda job: one(folder / str(job[0]), *job[1]), enumerate(todo))
+        for key, result in zip(todo, tqdm(results, total=len(todo), mininterval=30), strict=True):
+            loads.append(os.getloadavg()[0])
+            if result is None:
+                missed += 1  # it was over before it hung, or was rescued before its end
+                continue
+            rows.setdefault(key, []).append(result[0])
+            if result[1]:
+                wrong.append((*key, *result))
+    print(f"load {np.median(loads):.1f}; {missed} that hung too late or too early, left out\n")
+    print("| the guard | and then | stood within 2 s, and said so | median ms | 99 % | most |")
+    print("|---|---|---|---|---|---|")
+    for (how, end), all_ms in sorted(rows.items()):
+        bad = sum(one[:2] == (how, end) for one in wrong)
+        print(f"| {how} | {end} | {len(all_ms) - bad} of {len(all_ms)} | {_quantiles(all_ms)} |")
+    for row in wrong:
+        print(row)
+
+
+def _hung(folder: Path, how: str, end: str) -> tuple[float, str] | None:
+    """How late it stood, in ms, and what was wrong with that, nothing as a rule."""
+    folder.mkdir()
+    log, hangs = folder / "log", folder / "hangs"
+    signalled = end.startswith("SIG")
+    after_s = random.uniform(0.3, 1.2)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.helpers.dying_parent", str(log), ENDS_WELL,
+         f"{60.0 if signalled else after_s}"],
+        cwd=ROOT, env=ENVIRONMENT | {"HANGS": str(hangs)}, preexec_fn=_hear_signals,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while not any(t for _, t in _throttles("a process", log)) and process.poll() is None:
+        time.sleep(0.01)
+    time.sleep(0.0 if signalled else max(0.0, after_s - random.uniform(0.1, 0.8)))
+    due_ns = _hang_and_signal(process, hangs, how, end)
+    out, err = process.communicate(timeout=120)
+    lines = [*out.splitlines(), "", ""]
+    due_ns = due_ns or int(lines[0])
+    if "None; None" in lines[1] or not lines[1].startswith((end, "closed")):
+        return None
+    said = "gave no answer" in lines[1] and process.returncode == 0
+    return _stood(log, due_ns, "" if said else f"{lines} {err[-200:]}")
+
+
+def _hang_and_signal(
+    process: "subprocess.Popen[str]", hangs: Path, how: str, end: str
+) -> int | None:
+    """Let the guard hang; then signal, one in two followed by a Ctrl-C: when, in ns."""
+    part = hangs.with_suffix(".part")
+    part.write_text(how)
+    part.rename(hangs)
+    if not end.startswith("SIG"):
+        return None
+    time.sleep(random.uniform(0.1, 0.8))
+    due_ns = time.monotonic_ns()
+    process.send_signal(getattr(signal, end))
+    if random.random() < 0.5:
+        time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+    return due_ns
+
+
+def _stood(log: Path, due_ns: int, wrong: str) -> tuple[float, str]:
+    told = _throttles("a process", log)
+    end_s = time.monotonic() + 5.0
+    while told[-1][1] and time.monotonic() < end_s:
+        time.sleep(0.05)
+        told = _throttles("a process", log)
+    if told[-1][1]:
+        return float("inf"), f"never stood {wrong}"
+    last = max(index for index, (_, throttle) in enumerate(told) if throttle)
+    late_ms = (told[last + 1][0] - due_ns) / 1e6
+    return late_ms, wrong or ("late" if late_ms > 2000 else "")
+
+
+def _drive_lasts_s(folder: Path) -> float:
+    """From the first throttle to arrival, of a drive that nothing befalls."""
+    for name in ("compiles", "is-timed"):
+        log = folder / f"{name}.log"
+        command = _command("a process", log, folder / f"{name}.mcap")
+        subprocess.run(command, env=ENVIRONMENT, check=True, capture_output=True)
+    driven_ns = [stamp_ns for stamp_ns, throttle in _throttles("a process", log) if throttle]
+    return (driven_ns[-1] - driven_ns[0]) / 1e9
+
+
+def _hung_run(folder: Path, how: str, end: str, lasts_s: float) -> tuple[float, str] | None:
+    """The same by `jaxnav run`."""
+    folder.mkdir()
+    log, record, hangs = folder / "log", folder / "drive.mcap", folder / "hangs"
+    duration_s = random.uniform(1.2, lasts_s - 0.5)
+    command = [*_command("a process", log, record), "--option", f"hangs={hangs}"]
+    command += ["--duration-s", f"{duration_s}"] if end == "time is over" else []
+    process = subprocess.Popen(
+        command, env=ENVIRONMENT, preexec_fn=_hear_signals,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    while not any(t for _, t in _throttles("a process", log)) and process.poll() is None:
+        time.sleep(0.01)
+    before_s = random.uniform(0.2, 0.8)
+    at_s = {"time is over": duration_s, "arrived": lasts_s}.get(end, random.uniform(1.0, lasts_s))
+    time.sleep(max(0.0, at_s - before_s))
+    due_ns = _hang_and_signal(process, hangs, how, end)
+    out, err = process.communicate(timeout=120)
+    if due_ns is None:
+        outcomes = read_drive(record).outcomes
+        done_ns = outcomes.now_ns[outcomes.done] if end == "arrived" else outcomes.now_ns
+        if not len(done_ns):
+            return None
+        due_ns = int(done_ns[0] + (0.5 if end == "arrived" else duration_s) * 1e9)
+    if not out.startswith(f"ended: {end}\n") or process.returncode == 0:
+        return None
+    said = "gave no answer" in err and process.returncode == 1
+    return _stood(log, due_ns, "" if said else f"{process.returncode} {err[-300:]}")
+
+
 def soak(minutes: float, processes: int) -> None:
     """Drives of the simulated car, one after the other, for so long: no stop that is not asked for,
     and every one that is. Beside each stop: how late others woke then that only sleep."""
@@ -330,18 +463,21 @@ def _soaked(folder: Path, number: int) -> _Drive:
 def main() -> None:
     """What is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["deaths", "signals", "soak"])
+    parser.add_argument("what", choices=["deaths", "signals", "hangs", "soak"])
     parser.add_argument("--each", type=int, default=50)
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--whole", action="store_true", help="hangs: of `jaxnav run`")
     args = parser.parse_args()
     if args.what == "deaths":
         deaths(args.each, args.jobs, args.load)
     elif args.what == "signals":
         signals(args.count, args.jobs, args.seed)
+    elif args.what == "hangs":
+        hangs(args.each, args.jobs, args.load, args.whole)
     else:
         soak(args.minutes, args.load)
 

@@ -43,6 +43,7 @@ class Guard:
         reason: why the guard has tripped; None: it has not.
         unheard: why the last stop did not reach the vehicle; None: it did, or there was none.
         late: whether all that it has tripped for is something that did not come in time.
+        tried_s: `time.monotonic()` at which the vehicle's `stop` last came back, well or not.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class Guard:
         self._deadline_ns = self._written_ns
         self.unheard: str | None = None
         self._stopped_s = 0.0  # time of the last stop that reached it
+        self.tried_s = 0.0  # when the vehicle's `stop` has last returned or raised
         self._thread = threading.Thread(target=self._watch, name="jaxnav-guard", daemon=True)
         self._thread.start()
         atexit.register(self._at_exit)
@@ -89,6 +91,11 @@ class Guard:
     def pauses(self) -> bool:
         """Whether the guard has stopped the vehicle and may arm again."""
         return self.tripped and self.late and self._resumes
+
+    @property
+    def heard(self) -> bool:
+        """Whether the vehicle has heard the last stop."""
+        return self.unheard is None and self._stopped_s > 0
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the guard trips or the time is over; return whether it has tripped."""
@@ -252,6 +259,7 @@ class Guard:
             self.unheard = f"{type(error).__name__}: {error}"
         else:
             self.unheard, self._stopped_s = None, time.monotonic()
+        self.tried_s = time.monotonic()
 
     def _at_exit(self) -> None:
         self.trip("the program ends")

@@ -1,6 +1,6 @@
 """The process that owns the vehicle and stops it, whatever happens to the computing process.
 
-    python -m jaxnav.loop.guard_process COMMANDS READINGS     # file descriptors of two sockets
+    python -P -m jaxnav.loop.guard_process COMMANDS READINGS SPARE    # file descriptors of sockets
 
 `moved_vehicle` starts it and talks to it. It imports no JAX and no OpenCV, is up in a fifth of a
 second, and runs the plug-in behind a `Guard` with its limits and corrections. Each command carries
@@ -9,7 +9,12 @@ comes too late is not obeyed, and when none comes in time the vehicle is stopped
 once when the computing process ends, however it ends, since that closes the sockets.
 
 On the first socket JSON and commands come in and events go out; on the second a byte requests a
-reading. All of these are framed, see `Link`.
+reading. All of these are framed, see `Link`. Once it has tripped, it says ten times a second
+whether the vehicle has heard the stop. A driver that holds the interpreter silences it, and so does
+one that does not come back from `stop`.
+
+At once it forks another process, the spare, which waits on the third socket. Where this one hangs
+or dies the spare opens the vehicle and stops it: then nothing that may have run out is needed.
 """
 
 from __future__ import annotations
@@ -58,7 +63,10 @@ HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle 
 _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
 _PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
 _LARGEST = 2**24
-_LOOK_S = 0.02
+_SAYS_S = 0.1  # period at which it says whether a stop was heard; `moved_vehicle` waits for five
+# A `stop` that lasts longer counts as no answer. With the longest wait for a command (0.2 s by
+# default) and for an answer (0.5 s) it leaves 0.8 of 2 s for another one to open the vehicle.
+_TRIES_S = 0.5
 
 
 def command_frame(sequence: int, deadline_ns: int, command: Command) -> bytes:
@@ -109,6 +117,12 @@ class Link:
         """Send a mapping as JSON."""
         self.send(KIND_TEXT + json.dumps(said).encode())
 
+    def ready(self, timeout_s: float) -> bool:
+        """Wait until `receive` would not; return whether that is so before the time is over."""
+        look = select.poll()  # not `select`, which can't look at descriptors above 1023
+        look.register(self.socket, select.POLLIN)
+        return bool(self._frames or look.poll(timeout_s * 1e3))
+
     def receive(self) -> list[bytes]:
         """The complete frames received, possibly none; waits for bytes if no frame is ready.
 
@@ -142,8 +156,9 @@ class Link:
         return said
 
 
-class CanNotMoveError(Exception):
-    """A vehicle needs the computing process; the message says why."""
+class CanNotMoveError(BaseException):
+    """A vehicle needs the computing process; the message says why. A plug-in's `except Exception`
+    does not catch it."""
 
 
 class _Missing:
@@ -156,8 +171,13 @@ class _Missing:
         raise CanNotMoveError(f"it looks at setup.{self._name}")
 
 
-def main(commands: int, readings: int) -> None:
-    """Serve until the vehicle can be released."""
+def main(commands: int, readings: int | None, spare: int | None = None) -> None:
+    """Serve until the vehicle can be released.
+
+    Args:
+        commands, readings: descriptors of the sockets; the spare has no use for the second.
+        spare: id of the spare's process.
+    """
     for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTOU", "SIGPIPE"):
         signal.signal(getattr(signal, name), signal.SIG_IGN)  # the computing process handles them
     wakeup = os.pipe()
@@ -165,22 +185,23 @@ def main(commands: int, readings: int) -> None:
     signal.set_wakeup_fd(wakeup[1], warn_on_full_buffer=False)
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # sent when the machine shuts down
     link = Link(socket.socket(fileno=commands))
-    asked = Link(socket.socket(fileno=readings))
     with suppress(EOFError, OSError):
         order = link.mapping()
+        only_stops = order.get("only_stops", False)  # in the place of one that hung or died
+        if only_stops:
+            link.tell(received=True)
+            _preferred()  # before the plug-in is imported, as the vehicle may be driving
         try:
             factory = _factory(order["vehicle"], order["path"])
-            link.tell(ready=True)
-            order = {**order, **link.mapping()}
+            if not only_stops:
+                link.tell(ready=True, spare=spare)
+                order |= link.mapping()
             vehicle = opened(factory, order)
         except CanNotMoveError as problem:
             link.tell(stays=str(problem))
             return
         except BadInput as bad:
             link.tell(bad=str(bad))
-            return
-        if order.get("only_stop"):
-            _stop_for_good(vehicle, order)
             return
         priority = _preferred()  # of this thread, and of the guard's thread, which it starts
         guard = Guard(
@@ -193,7 +214,9 @@ def main(commands: int, readings: int) -> None:
         threading.Thread(target=_report, args=(guard, link), daemon=True).start()
         try:
             link.tell(opened=float(vehicle.timeout_s), priority=priority)
-            _Server(vehicle, guard, link, asked, wakeup[0]).serve()
+            if readings is not None and not only_stops:
+                asked = Link(socket.socket(fileno=readings))
+                _Server(vehicle, guard, link, asked, wakeup[0]).serve()
         finally:
             guard.close(HEARD_WITHIN_S)
             with suppress(OSError):
@@ -265,13 +288,18 @@ class _Server:
 
 
 def _report(guard: Guard, link: Link) -> None:
-    """Report each trip at once: in a thread, since the main one may hang in the driver."""
-    while True:
-        guard.wait()
-        with suppress(OSError):
-            link.tell(tripped=guard.reason, late=guard.late)
-        while guard.tripped:  # until it resumes
-            time.sleep(_LOOK_S)
+    """Report each trip at once, and then, until it resumes, again and again whether the vehicle has
+    heard the stop: in a thread, since the main one may hang in the driver."""
+    with suppress(OSError):
+        while True:
+            guard.wait()
+            since_s = time.monotonic()
+            reason = guard.reason
+            link.tell(tripped=reason, late=guard.late)
+            while guard.tripped and guard.reason == reason:
+                if guard.heard or time.monotonic() - max(since_s, guard.tried_s) < _TRIES_S:
+                    link.tell(heard=guard.heard, unheard=guard.unheard)
+                time.sleep(_SAYS_S)
 
 
 def _factory(name: str, path: list[str]) -> Any:
@@ -305,12 +333,6 @@ def opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
     return plugins.opened_vehicle(order["vehicle"], factory, setup)
 
 
-def _stop_for_good(vehicle: AnyVehicle, order: dict[str, Any]) -> None:
-    """Stop and close the vehicle of a guard's process that has died."""
-    guard = Guard(vehicle, limits_from(order["limits"]), order["timeout_s"])
-    guard.close(HEARD_WITHIN_S)
-
-
 def _preferred() -> str:
     """Raise the process's priority and lock its memory where permitted; describe the priority."""
     with suppress(OSError):  # killed last when memory runs out
@@ -323,7 +345,18 @@ def _preferred() -> str:
     return "raised priority" if lower_nice(NICE) else "no priority: it may not be raised here"
 
 
+def _forked() -> int | None:
+    """Fork the spare, before there is a thread; return its id, 0 in itself, None without room."""
+    with suppress(OSError):
+        return os.fork()
+    return None
+
+
 if __name__ == "__main__":
+    ends = [int(number) for number in sys.argv[1:]]
+    child = _forked()
+    for end in ends[:2] if child == 0 else ends[2:]:
+        os.close(end)  # whoever is at the other end must notice this one's death
     with FreeOutput():  # a driver that prints errors must not wait for a reader
-        main(int(sys.argv[1]), int(sys.argv[2]))
+        main(ends[2], None) if child == 0 else main(ends[0], ends[1], child)
     os._exit(0)  # the vehicle is released: what else a plug-in has loaded needs no cleanup

@@ -8,8 +8,10 @@ Every problem of a plug-in is reported in one line for a person.
 
 import contextlib
 import importlib
+import traceback
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Any
 
 from jaxnav.errors import BadInput
@@ -121,8 +123,7 @@ def _imported(flag: str, name: str, module: str) -> Any:
         return importlib.import_module(module)
     except ImportError as error:
         raise _not_importable(flag, name, error) from error
-    except Exception as error:
-        # A plug-in is foreign code: its import may raise anything.
+    except (Exception, SystemExit) as error:  # it is foreign code
         raise BadInput(flag, f"{name}: importing {module} failed: {_said(error)}") from error
 
 
@@ -131,8 +132,11 @@ def _opened(flag: str, name: str, factory: Callable[..., Any], *args: object) ->
         return factory(*args)
     except ImportError as error:  # a factory may import its driver
         raise _not_importable(flag, name, error) from error
-    except OSError as error:
-        raise BadInput(flag, f"{name} could not be opened: {_said(error)}") from error
+    except BadInput:
+        raise
+    except (Exception, SystemExit) as error:  # it is foreign code; its author needs the place
+        where = "" if isinstance(error, OSError) else _place(error)
+        raise BadInput(flag, f"{name} could not be opened: {_said(error)}{where}") from error
 
 
 def _not_importable(flag: str, name: str, error: ImportError) -> BadInput:
@@ -169,5 +173,11 @@ def _listed(names: Sequence[object]) -> str:
     return ", ".join(map(str, names)) or "none"
 
 
-def _said(error: Exception) -> str:
+def _place(error: BaseException) -> str:
+    """The innermost line of Python that an error has come through, to follow its text."""
+    *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+    return f" ({Path(frame.f_code.co_filename).name}:{line})"
+
+
+def _said(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

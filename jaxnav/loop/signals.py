@@ -26,6 +26,7 @@ _LEAVES_S = 1.0  # after a signal, while nothing moves and the main thread compi
 _FINISHES_S = 0.5  # for what must be finished before the process is ended
 _ENDS_S = 60.0  # after a signal, while a vehicle is open: longer than closing it may take
 EXIT = 128  # plus the signal's number, as shells report it
+EXIT_STOPPED = 1  # not by a person
 
 
 class Interrupted(BaseException):
@@ -41,10 +42,13 @@ class Signals:
 
     Attributes:
         number: number of the first signal that came; None: none has.
+        unheard: whether a vehicle is open that may not have heard, from its own guard, that it must
+            stop: then that is how the process has ended, whatever signal came.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
+        self.unheard = False
         self._held = self._over = False
         self._seen = threading.Event()  # set when the main thread has noticed the signal
         self._came = threading.Event()
@@ -82,7 +86,9 @@ class Signals:
     @property
     def exit_code(self) -> int | None:
         """The exit code of a process that a signal has ended; None: no signal came."""
-        return None if self.number is None else EXIT + self.number
+        if self.number is None:
+            return None
+        return EXIT_STOPPED if self.unheard else EXIT + self.number
 
     def check(self) -> None:
         """Raise if a signal came. The main thread calls it at every step.

@@ -4,6 +4,7 @@ This process writes every box, wherever it ran. On a cluster Dask carries tasks 
 restarts the tasks of a dead worker, and shows its dashboard.
 """
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -142,6 +143,9 @@ def local_cluster(workers: int) -> Iterator["Client"]:
 
     from distributed import Client, LocalCluster
 
+    # Dask starts workers, later ones too, and multiprocessing a process of its own, by `python -c`,
+    # which would import from the current folder.
+    os.environ["PYTHONSAFEPATH"] = "1"
     with (
         LocalCluster(
             n_workers=workers,

@@ -1,15 +1,20 @@
 """Render the images of the simulated car's cameras in a process of their own.
 
+    python -P -m jaxnav.vehicles.rendering_process CONNECTION    # a file descriptor
+
 Rendering takes more of a core than a car's computer has to spare, and holds the interpreter
 meanwhile: in the loop's process that would be a fault that no real camera causes.
 """
 
-import multiprocessing
-from multiprocessing.connection import Connection
+import subprocess
+import sys
+from contextlib import suppress
+from multiprocessing.connection import Connection, Pipe
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxnav.loop.moved_vehicle import start_python
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 
@@ -28,13 +33,9 @@ class RenderingProcess:
 
     def __init__(self, rig: CameraRig, markers: MarkerMap, seed: int):
         """Start the process and wait until it has rendered a first set of images."""
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_serve, args=(theirs, rig, markers, seed), name="jaxnav-rendering", daemon=True
-        )
-        self._process.start()
-        theirs.close()
+        self._connection, theirs = Pipe()
+        self._process = start_python(__name__, [theirs], {})
+        self._connection.send((rig, markers, seed))
         self.render(np.tile([0.0, 0.0, 0.0], (_POSES, 1)))
 
     def render(
@@ -59,14 +60,16 @@ class RenderingProcess:
         """End the process. May be called any number of times."""
         self._connection.close()
         self._process.terminate()
-        self._process.join(2.0)
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(2.0)
 
 
-def _serve(connection: Connection, rig: CameraRig, markers: MarkerMap, seed: int) -> None:
+def _serve(connection: Connection) -> None:
     from jaxnav.simulation.rendering import Renderer
     from jaxnav.simulation.scene import Scene
     from jaxnav.simulation.sensor import Sensor, Shutter
 
+    rig, markers, seed = connection.recv()
     sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)
     renderer = Renderer(
         Scene.create(markers, seed=seed), rig, Shutter(exposure_s=EXPOSURE_S), sensor, threads=1
@@ -75,7 +78,7 @@ def _serve(connection: Connection, rig: CameraRig, markers: MarkerMap, seed: int
     while True:
         try:
             poses = connection.recv()
-        except (EOFError, OSError, KeyboardInterrupt):
+        except (EOFError, OSError):
             return
 
         def pose_at(at_s: np.ndarray, poses: np.ndarray = poses) -> np.ndarray:
@@ -85,3 +88,7 @@ def _serve(connection: Connection, rig: CameraRig, markers: MarkerMap, seed: int
             return np.column_stack([np.cos(half), zero, zero, np.sin(half), x_m, y_m, zero])
 
         connection.send(renderer.render(pose_at, 0.0, rng))
+
+
+if __name__ == "__main__":
+    _serve(Connection(int(sys.argv[1])))

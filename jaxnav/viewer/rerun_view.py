@@ -209,7 +209,7 @@ def _file_sink(rerun: ModuleType, path: Path) -> Any:
 def viewer_command(port: int) -> list[str]:
     """The command that opens a window of Rerun listening on a port of this machine."""
     own = ["--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen"]
-    return [sys.executable, "-m", "rerun_cli", *own, "--memory-limit", "2GB"]
+    return [sys.executable, "-P", "-m", "rerun_cli", *own, "--memory-limit", "2GB"]
 
 
 def _open_viewer() -> tuple[subprocess.Popen[bytes], str]:

@@ -2,7 +2,8 @@
 
     python -m tests.helpers.dying_parent LOG HOW AFTER_S
 
-It prints when, `time.monotonic_ns()`, right before.
+It prints when, `time.monotonic_ns()`, right before. An environment variable HANGS names the file
+of that option of the car.
 """
 
 import ctypes
@@ -12,6 +13,7 @@ import resource
 import signal
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +21,7 @@ from jaxnav.loop.guard import Guard
 from jaxnav.loop.interfaces import Setup
 from jaxnav.loop.limits import Limits
 from jaxnav.loop.moved_vehicle import GuardProcess
+from jaxnav.loop.signals import Signals
 from tests.helpers import plain_car
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
@@ -89,26 +92,33 @@ ENDS = {
     "full core": spin,
     "exit": lambda: os._exit(3),
 }
+ENDS_WELL = "end of time"  # or by a signal, before
 
 
 def main(log: str, how: str, after_s: float) -> None:
     """Drive, and end."""
+    signals = Signals()
     guarding = GuardProcess(plain_car.NAME)
     guarding.prepare(lambda: None)
-    vehicle = guarding.open(make_setup(log=log), LIMITS, 0.2)
+    options = {"hangs": os.environ["HANGS"]} if "HANGS" in os.environ else {}
+    vehicle = guarding.open(make_setup(log=log, **options), LIMITS, 0.2)
     assert vehicle is not None, guarding.stays
     guard = Guard(vehicle, LIMITS)
     vehicle.watch(guard.trip)
+    signals.on_signal(guard.trip)
     guard.arm()
     end_s = time.monotonic() + after_s
-    while time.monotonic() < end_s:
-        vehicle.read()
+    while time.monotonic() < end_s and signals.number is None:
+        with suppress(OSError):
+            vehicle.read()
         guard.write(0.0, 0.2)
         time.sleep(0.02)
-    guard.write(0.0, 0.2)
     os.write(1, f"{time.monotonic_ns()}\n".encode())
-    ENDS[how]()
+    if how != ENDS_WELL:
+        guard.write(0.0, 0.2)
+        ENDS[how]()
     guard.close()
+    os.write(1, f"{guard.reason}; {vehicle.replaced}; {vehicle.unheard}\n".encode())
 
 
 if __name__ == "__main__":

@@ -5,8 +5,11 @@ line of the file `log`: when, `time.monotonic_ns()`, steering and throttle that 
 process that told it.
 """
 
+import ctypes
 import math
 import os
+import signal
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +20,19 @@ from jaxnav.vehicles.qcar import Servo
 NAME = f"{__name__}:open_vehicle"
 
 
+HANGS_S = 30
+HANGS = {
+    "held": lambda: ctypes.PyDLL(None).sleep(HANGS_S),
+    "locked": lambda: time.sleep(HANGS_S),
+    "stopped": lambda: os.kill(os.getpid(), signal.SIGSTOP),
+}
+
+
 class PlainCar:
     """Options: log, the file; deaf, a file while which exists nothing gets through; slow, a file
-    that says how many seconds a `read` takes."""
+    that says how many seconds a `read` takes; hangs, a file that says how the next word hangs:
+    `held` has C code hold the interpreter, `locked` waits with the driver's lock, `stopped`
+    suspends the process."""
 
     timeout_s = math.inf  # it obeys its last command for ever: nothing but the guard stops it
 
@@ -28,6 +41,8 @@ class PlainCar:
         self._file = os.open(options["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
         self._deaf = Path(options.get("deaf", "/nonexistent"))
         self._slow = Path(options.get("slow", "/nonexistent"))
+        self._hangs = Path(options.get("hangs", "/nonexistent"))
+        self._lock = threading.RLock()  # as many drivers have
         self._servo = Servo(self._model.steering_rate_limit_radps)
         self._speed_mps = self._throttle = 0.0
         self._time_ns = time.monotonic_ns()
@@ -39,13 +54,17 @@ class PlainCar:
         return Odometry(now_ns, self._speed_mps, self._servo.angle_at(now_ns))
 
     def write(self, steering_rad, throttle):
-        self._tell(steering_rad, throttle)
+        with self._lock:
+            if self._hangs.exists():
+                HANGS[self._hangs.read_text()]()
+            self._tell(steering_rad, throttle)
         now_ns = self._moved()
         self._servo.turn_to(steering_rad, now_ns)
         self._throttle = throttle
 
     def stop(self):
-        self._tell(0.0, 0.0)
+        with self._lock:
+            self._tell(0.0, 0.0)
         self._throttle = 0.0
 
     def close(self):

@@ -1,6 +1,7 @@
 """The guard's process: whatever happens to the computing process, the vehicle stops, and soon."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from jaxnav.errors import BadInput
+from jaxnav.loop import moved_vehicle
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.moved_vehicle import GuardProcess
 from tests.helpers import plain_car
@@ -19,6 +21,7 @@ from tests.helpers.plain_car import words
 
 ROOT = Path(__file__).resolve().parents[2]
 STOPS_S = 0.2
+REPLACED_S = 2.0
 SLACK_S = 0.3  # of a machine that does something else; measured without it by bench_stop.py
 
 
@@ -40,7 +43,7 @@ def closing_of(guarding):
 class Drive:
     """A car behind a guard's process, from this one."""
 
-    def __init__(self, folder, here=False, there=False, **options):
+    def __init__(self, folder, timeout_s=0.2, here=False, there=False, **options):
         """Args:
         here, there: whether the guards may resume.
         """
@@ -48,9 +51,9 @@ class Drive:
         self.guarding = GuardProcess(plain_car.NAME)
         self.guarding.prepare(lambda: None)
         self.vehicle = self.guarding.open(
-            make_setup(log=self.log, **options), LIMITS, 0.2, resumes=there
+            make_setup(log=self.log, **options), LIMITS, timeout_s, resumes=there
         )
-        self.guard = Guard(self.vehicle, LIMITS, resumes=here)
+        self.guard = Guard(self.vehicle, LIMITS, timeout_s, resumes=here)
         self.vehicle.watch(self.guard.trip, lambda: self.guard.late)
         self.guard.arm()
 
@@ -234,8 +237,113 @@ def test_a_bus_that_is_out_for_long_hears_the_stop_when_it_is_back(tmp_path):
     assert words(drive.log)[-1].throttle == 0.2  # the last that it has heard
     deaf.unlink()
     wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    assert words(drive.log)[-1].pid == drive.vehicle.pid  # it answered, and was left alone
     drive.guard.close()
+    assert (drive.vehicle.unheard, drive.vehicle.replaced) == (None, None)
+
+
+def hang(drive, how):
+    """Let the car hang in its next word; returns when the guard's process is silent."""
+    (drive.log.parent / "hangs").write_text(how)
+    drive.drive(0.15)  # the last ones are not obeyed any more
+    assert drive.driven()
+    assert words(drive.log)[-1].throttle
+    (drive.log.parent / "hangs").unlink()
+
+
+ENDINGS = {
+    "a stop": lambda drive: drive.guard.trip("told to"),
+    "the end": lambda drive: drive.guard.close(),
+    "two signals": lambda drive: [drive.guard.trip(name) for name in ("SIGINT", "SIGTERM")],
+}
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("how", plain_car.HANGS)
+def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, ending):
+    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
+    drive.drive()
+    hang(drive, how)
+    pid, due_ns = drive.vehicle.pid, time.monotonic_ns()
+    ENDINGS[ending](drive)
+    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    # A `stop` that does not return is waited for, after the last command's time is over.
+    within_s = REPLACED_S + (0.6 if how == "locked" else 0.0)
+    assert (drive.stood_ns() - due_ns) / 1e9 < within_s
+    assert words(drive.log)[-1].pid not in (pid, os.getpid())
+    drive.guard.close()
+    assert (time.monotonic_ns() - due_ns) / 1e9 < within_s + SLACK_S
     assert drive.vehicle.unheard is None
+    assert "gave no answer for 0." in drive.vehicle.replaced
+    assert drive.guarding.process.poll() == -signal.SIGKILL
+
+
+def test_nobody_needs_to_ask_for_a_reading_for_a_hang_to_be_noticed(tmp_path):
+    drive = Drive(tmp_path, hangs=tmp_path / "hangs")
+    drive.drive()
+    hang(drive, "stopped")  # the loop asks no more: its own guard stops the vehicle
+    assert drive.guard.wait(2.0)
+    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    assert words(drive.log)[-1].pid != drive.vehicle.pid
+    drive.guard.close()
+
+
+def test_where_nothing_can_be_opened_or_started_any_more_it_is_replaced_too(tmp_path):
+    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
+    drive.drive()
+    hang(drive, "stopped")
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
+    try:
+        drive.guard.trip("told to")
+        drive.guard.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert words(drive.log)[-1].throttle == 0
+    assert words(drive.log)[-1].pid == drive.guarding.spare_pid
+
+
+def test_where_the_spare_hangs_as_well_another_one_is_started(tmp_path):
+    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
+    drive.drive()
+    hang(drive, "stopped")
+    os.kill(drive.guarding.spare_pid, signal.SIGSTOP)
+    drive.guard.close()
+    assert words(drive.log)[-1].throttle == 0
+    assert words(drive.log)[-1].pid not in (drive.vehicle.pid, drive.guarding.spare_pid)
+    assert drive.vehicle.unheard is None
+
+
+def test_what_no_process_could_stop_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(moved_vehicle, "_CLOSES_S", 1.0)
+    deaf = tmp_path / "deaf"
+    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs", deaf=deaf)
+    drive.drive()
+    hang(drive, "stopped")
+    deaf.touch()
+    drive.guard.close(heard_within_s=1.0)
+    assert drive.vehicle.replaced is None
+    assert "no answer" in drive.vehicle.unheard
+    assert drive.vehicle.unheard.endswith("OSError: the bus is out")
+    deaf.unlink()
+    wait_for(lambda: words(drive.log)[-1].throttle == 0)  # whoever was started says it until then
+
+
+def test_a_vehicle_that_does_not_hear_its_guard_is_left_to_it_in_the_end(tmp_path, monkeypatch):
+    monkeypatch.setattr(moved_vehicle, "_CLOSES_S", 1.0)
+    deaf = tmp_path / "deaf"
+    drive = Drive(tmp_path, deaf=deaf)
+    drive.drive()
+    deaf.touch()
+    drive.guard.close()
+    assert drive.vehicle.unheard == (
+        "OSError: the bus is out; the guard's process still tells it to stop"
+    )
+    assert drive.guarding.process.poll() is None
+    deaf.unlink()
+    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    assert words(drive.log)[-1].pid == drive.vehicle.pid
+    assert drive.guarding.process.wait(10) == 0
 
 
 def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):

@@ -79,6 +79,9 @@ def test_cameras_are_found_and_told_of_the_vehicle(module):
         ("somebodys:old", "could not be imported: ImportError: cannot import name 'x' from 'y'"),
         ("somebodys:unplugged", "could not be opened: FileNotFoundError: [Errno 2] no /dev/car"),
         ("somebodys:refuses", "--option speed: expected a number"),
+        ("somebodys:broken", "could not be opened: IndexError: list index out of range (test_plug"),
+        ("somebodys:leaves", "could not be opened: SystemExit: 3 (test_plugins.py:"),
+        ("somebodys:silent", "could not be opened: AssertionError (test_plugins.py:"),
     ],
 )
 def test_what_is_wrong_with_a_vehicle_is_one_line(module, name, problem):
@@ -95,17 +98,13 @@ def test_what_is_wrong_with_a_vehicle_is_one_line(module, name, problem):
     module.old = raises(ImportError("cannot import name 'x' from 'y'"))
     module.unplugged = raises(FileNotFoundError(2, "no /dev/car"))
     module.refuses = raises(BadInput("--option speed", "expected a number"))
+    module.broken = lambda setup: [][0]
+    module.leaves = raises(SystemExit(3))
+    module.silent = raises(AssertionError())
     with pytest.raises(BadInput) as raised:
         open_vehicle(name, SETUP)
     assert problem in str(raised.value)
     assert str(raised.value).startswith("--")
-
-
-def test_an_error_of_the_plug_in_itself_stays_one(module):
-    """Its author needs the traceback."""
-    module.broken = lambda setup: [][0]
-    with pytest.raises(IndexError):
-        open_vehicle("somebodys:broken", SETUP)
 
 
 def test_a_module_that_fails_on_import_is_one_line(tmp_path, monkeypatch):

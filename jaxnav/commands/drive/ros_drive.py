@@ -174,8 +174,8 @@ class _Driving:
                 self._drive.guard.trip(reason)
             self._thread.join(_LOOK_S)
         _close(self._observers, self._say)
-        if self._drive.unheard is not None:
-            self._say(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {self._drive.unheard}")
+        if self._drive.heard is not None:
+            self._say(self._drive.heard)
 
     def _drives(self) -> None:
         try:

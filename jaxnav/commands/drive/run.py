@@ -38,12 +38,11 @@ from jaxnav.loop.moved_vehicle import GuardProcess, MovedVehicle
 from jaxnav.loop.pilot import Pilot
 from jaxnav.loop.priority import before_others
 from jaxnav.loop.seeing import Eyes, Search
-from jaxnav.loop.signals import Signals
+from jaxnav.loop.signals import EXIT_STOPPED, Signals
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.recording.drive_setup import DriveSetup
 
-EXIT_STOPPED = 1  # by the watchdog, not by a person
 # How far the clock of a simulated vehicle runs ahead of a thread that does not come back: longer
 # than a camera's thread waits (0.05 s), shorter than the odometer takes to be stale (0.1 s).
 _AHEAD_S = 0.08
@@ -91,15 +90,17 @@ def run(args: Run, signals: Signals) -> int:
         signals.check()
         resumes = args.vehicle is not None and may_resume(args.vehicle)
         drive = Drive(args, vehicle_setup, guarding, signals, resumes=resumes)
-        reason = drive.run(pilot, searches, onlookers)
+        try:
+            reason = drive.run(pilot, searches, onlookers)
+        finally:  # also of a drive that raises
+            if drive.heard is not None:
+                sys.stderr.write(f"{visible(drive.heard)}\n")
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
     for onlooker in onlookers:
         if onlooker.closing_note is not None:
             print(onlooker.closing_note)
-    if drive.unheard is not None:
-        print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
-    return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0
+    return EXIT_STOPPED if drive.loop.stopped or drive.heard is not None else 0
 
 
 def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
@@ -179,14 +180,15 @@ class Drive:
     Attributes:
         guard: of this process, once the vehicle is open.
         kept_by: in words, the guard that stops the vehicle whatever happens here.
-        unheard: why the vehicle may not have heard the last stop; None where it has.
+        heard: once it is closed, where the last stop did not reach the vehicle, or not by its own
+            guard: a line that says so. None where it did.
     """
 
     loop: Loop
     eyes: Eyes
     guard: Guard | None = None
     kept_by = ""
-    unheard: str | None = None
+    heard: str | None = None
 
     def __init__(
         self,
@@ -220,6 +222,7 @@ class Drive:
             signals.hold()
             vehicle, guard = self._guarded(pilot.limits)
             self.guard = guard
+            signals.unheard = True  # until it is known that it has
             closing.callback(self._close, vehicle, guard)
             if not vehicle.timeout_s < math.inf:
                 _warn(UNSTOPPED.format(car=args.car))
@@ -265,7 +268,14 @@ class Drive:
 
     def _close(self, vehicle: AnyVehicle, guard: Guard) -> None:
         guard.close()
-        self.unheard = vehicle.unheard if isinstance(vehicle, MovedVehicle) else guard.unheard
+        unheard, replaced = guard.unheard, None
+        if isinstance(vehicle, MovedVehicle):
+            unheard, replaced = vehicle.unheard, vehicle.replaced
+        if unheard is not None:
+            self.heard = f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {unheard}"
+        elif replaced is not None:
+            self.heard = f"{replaced}; another one has stopped the vehicle"
+        self._signals.unheard = self.heard is not None
 
 
 def _say(args: Run, text: str) -> None:
