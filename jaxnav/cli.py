@@ -6,7 +6,7 @@ What a command does lies in `jaxnav.commands` and is imported when the command r
 Exit codes: 0 done, 1 what was to be found out is not well (a replay is not what was recorded, the
 doctor found an error, a fault came to worse than it must, the watchdog stopped the car), 2 bad
 input or usage (one line on stderr), 130 interrupted; `run`: 128 plus the number of the signal that
-ended it.
+ended it, or 1 where the vehicle's guard did not say that it was heard.
 """
 
 import contextlib
