@@ -312,7 +312,7 @@ def _hung(folder: Path, how: str, end: str) -> tuple[float, str] | None:
     out, err = process.communicate(timeout=120)
     lines = [*out.splitlines(), "", ""]
     due_ns = due_ns or int(lines[0])
-    if "None; None" in lines[1] or not lines[1].startswith((end, "closed")):
+    if lines[1] and ("None; None" in lines[1] or not lines[1].startswith((end, "closed"))):
         return None
     said = "gave no answer" in lines[1] and process.returncode == 0
     return _stood(log, due_ns, "" if said else f"{lines} {err[-200:]}")

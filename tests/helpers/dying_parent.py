@@ -98,6 +98,7 @@ ENDS_WELL = "end of time"  # or by a signal, before
 def main(log: str, how: str, after_s: float) -> None:
     """Drive, and end."""
     signals = Signals()
+    signals.hold()  # as a drive does: it ends when the vehicle is closed
     guarding = GuardProcess(plain_car.NAME)
     guarding.prepare(lambda: None)
     options = {"hangs": os.environ["HANGS"]} if "HANGS" in os.environ else {}
