@@ -271,14 +271,18 @@ def hangs(each: int, jobs: int, processes: int, whole: bool) -> None:
         todo = [(how, end) for _ in range(each) for how in ("stopped", "held") for end in ends]
         one = partial(_hung_run, lasts_s=lasts_s) if whole else _hung
         results = pool.map(lambda job: one(folder / str(job[0]), *job[1]), enumerate(todo))
-        for key, result in zip(todo, tqdm(results, total=len(todo), mininterval=30), strict=True):
-            loads.append(os.getloadavg()[0])
-            if result is None:
-                missed += 1  # it was over before it hung, or was rescued before its end
-                continue
-            rows.setdefault(key, []).append(result[0])
-            if result[1]:
-                wrong.append((*key, *result))
+        with suppress(KeyboardInterrupt):  # what has come by then is told
+            for key, result in zip(
+                todo, tqdm(results, total=len(todo), mininterval=30), strict=True
+            ):
+                loads.append(os.getloadavg()[0])
+                if result is None:
+                    missed += 1  # it was over before it hung, or was rescued before its end
+                    continue
+                rows.setdefault(key, []).append(result[0])
+                if result[1]:
+                    wrong.append((*key, *result))
+        pool.shutdown(cancel_futures=True)
     print(f"load {np.median(loads):.1f}; {missed} that hung too late or too early, left out\n")
     print("| the guard | and then | stood within 2 s, and said so | median ms | 99 % | most |")
     print("|---|---|---|---|---|---|")
@@ -308,7 +312,7 @@ def _hung(folder: Path, how: str, end: str) -> tuple[float, str] | None:
     out, err = process.communicate(timeout=120)
     lines = [*out.splitlines(), "", ""]
     due_ns = due_ns or int(lines[0])
-    if "None; None" in lines[1] or not lines[1].startswith((end, "closed")):
+    if lines[1] and ("None; None" in lines[1] or not lines[1].startswith((end, "closed"))):
         return None
     said = "gave no answer" in lines[1] and process.returncode == 0
     return _stood(log, due_ns, "" if said else f"{lines} {err[-200:]}")
@@ -462,6 +466,7 @@ def _soaked(folder: Path, number: int) -> _Drive:
 
 def main() -> None:
     """What is asked for."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["deaths", "signals", "hangs", "soak"])
     parser.add_argument("--each", type=int, default=50)

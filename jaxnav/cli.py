@@ -6,7 +6,7 @@ What a command does lies in `jaxnav.commands` and is imported when the command r
 Exit codes: 0 done, 1 what was to be found out is not well (a replay is not what was recorded, the
 doctor found an error, a fault came to worse than it must, the watchdog stopped the car), 2 bad
 input or usage (one line on stderr), 130 interrupted; `run`: 128 plus the number of the signal that
-ended it.
+ended it, or 1 where the vehicle's guard did not say that it was heard.
 """
 
 import contextlib
@@ -26,6 +26,7 @@ from jaxnav.loop.output import FreeOutput, fill_descriptors
 from jaxnav.loop.signals import Interrupted, Signals
 
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
+FILES = 64  # that a drive may have open: some 30 of its own, and those of drivers
 
 DESCRIPTION = (
     "Localise and drive a vehicle with one square marker and several cameras. "
@@ -61,6 +62,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A car may move: from here on no signal is lost, and no terminal holds anything up.
     fill_descriptors()
+    import resource  # of POSIX, as a drive is; other commands need none
+
+    if 0 <= (allowed := resource.getrlimit(resource.RLIMIT_NOFILE)[0]) < FILES:
+        # Where there is room for fewer, not even an import may succeed, and its error is no line.
+        print(f"{_name(args)}: ulimit -n: must be {FILES} or more, got {allowed}", file=sys.stderr)
+        return EXIT_BAD_INPUT
     signals = Signals()
     try:
         with FreeOutput():

@@ -169,7 +169,8 @@ class Vehicle(Protocol):
 
     def stop(self) -> None:
         """Set zero throttle now. May be called from any thread, also while another is inside `read`
-        or `write`, any number of times, also after `close`."""
+        or `write`, any number of times, also after `close`. Where it does not return within half a
+        second, the process is killed, and another one opens the vehicle and stops it."""
         ...
 
     def close(self) -> None:

@@ -98,12 +98,14 @@ ENDS_WELL = "end of time"  # or by a signal, before
 def main(log: str, how: str, after_s: float) -> None:
     """Drive, and end."""
     signals = Signals()
+    signals.hold()  # as a drive does: it ends when the vehicle is closed
     guarding = GuardProcess(plain_car.NAME)
     guarding.prepare(lambda: None)
     options = {"hangs": os.environ["HANGS"]} if "HANGS" in os.environ else {}
-    vehicle = guarding.open(make_setup(log=log, **options), LIMITS, 0.2)
+    timeout_s = 2.0 if options else 0.2  # that nobody stops it before it is to be stopped
+    vehicle = guarding.open(make_setup(log=log, **options), LIMITS, timeout_s)
     assert vehicle is not None, guarding.stays
-    guard = Guard(vehicle, LIMITS)
+    guard = Guard(vehicle, LIMITS, timeout_s)
     vehicle.watch(guard.trip)
     signals.on_signal(guard.trip)
     guard.arm()

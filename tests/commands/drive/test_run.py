@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parents[3]
 MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 STOPS_S = 0.2  # after a signal, at the latest
 SLACK_S = 0.3  # of a machine that does something else
+REPLACED_S = 2.0  # after the end of a drive whose guard hangs
 START_S = 120.0  # until it drives: the first one compiles, on a machine that is busy
 LITTLE_BYTES = 12_000  # more than the vehicle is told in a drive, less than is recorded of one
 ROUTE = """
@@ -135,15 +136,18 @@ def driving(
     moved: bool = False,
     stderr: int = subprocess.PIPE,
     terminal: int | None = None,
+    more: Sequence[str] = (),
 ) -> Iterator[Running]:
     """A drive, from when the vehicle has been told to move.
 
     Args:
         terminal: what it was started from.
+        more: arguments.
     """
     log, record = folder / "told", folder / "drive.mcap"
+    command = (workplace.moved if moved else workplace.driving)(log, record)
     process = subprocess.Popen(
-        on_terminal(terminal) + (workplace.moved if moved else workplace.driving)(log, record),
+        [*on_terminal(terminal), *command, *more],
         cwd=folder,
         env=workplace.environment(),
         stdout=subprocess.PIPE,
@@ -248,6 +252,50 @@ def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_pa
     assert ended.out.startswith("ended: the guard's process was ended by signal 9\n")
     assert f"{plain_car.NAME} does not stop by itself when all processes here are" in ended.err
     assert ended.told[-1].throttle == 0  # by another one that was started for it
+
+
+@pytest.mark.parametrize(
+    ("how", "end"), [("stopped", "SIGINT"), ("held", "SIGHUP"), ("held", "time is over")]
+)
+def test_a_guard_that_hangs_before_the_end_is_replaced_and_that_is_said(
+    workplace, tmp_path, how, end
+):
+    hangs = tmp_path / "hangs"
+    more = ["--option", f"hangs={hangs}", *["--duration-s", "2"] * (end == "time is over")]
+    with driving(workplace, tmp_path, moved=True, more=more) as drive:
+        first, *_ = plain_car.words(drive.log)
+        pid, due_ns = first.pid, first.stamp_ns + 2_000_000_000
+        if end == "time is over":  # half a second before
+            time.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9 - 0.5))
+        hangs.write_text(how)
+        if end.startswith("SIG"):
+            time.sleep(0.3)
+            due_ns = time.monotonic_ns()
+            drive.process.send_signal(getattr(signal, end))
+            time.sleep(0.1)
+            drive.process.send_signal(signal.SIGINT)  # once more: nothing is cut short
+        ended = drive.ended()
+    assert ended.out.startswith(f"ended: {end}\n")
+    assert ended.code == 1
+    assert "gave no answer for 0." in ended.err
+    assert "was killed; another one has stopped the vehicle\n" in ended.err
+    assert ended.told[-1].throttle == 0
+    assert plain_car.words(drive.log)[-1].pid != pid
+    assert (stood_ns(ended.told) - due_ns) / 1e9 < REPLACED_S
+
+
+@pytest.mark.parametrize("files", [5, 8, 12, 16, 24, 63])
+def test_where_too_few_files_may_be_open_nothing_is_begun(workplace, tmp_path, files):
+    log = tmp_path / "told"
+    limited = ["/bin/sh", "-c", f'ulimit -n {files}; exec "$@"', "sh"]
+    ended = subprocess.run(
+        [*limited, *workplace.moved(log, tmp_path / "drive.mcap")],
+        env=workplace.environment(),
+        capture_output=True,
+        text=True,
+    )
+    assert (ended.returncode, ended.stdout, list(tmp_path.iterdir())) == (2, "", [])
+    assert ended.stderr == f"jaxnav run: ulimit -n: must be 64 or more, got {files}\n"
 
 
 def test_a_terminal_that_is_stuck_holds_up_neither_the_drive_nor_its_end(workplace, tmp_path):
