@@ -40,6 +40,7 @@ class Fault(enum.IntFlag):
     # The estimate goes on without the gyro, and health stays as it is.
     GYRO_STALE = enum.auto()  # its file says that there is one, and it gave no rate in time
     GYRO_INVALID = enum.auto()  # a reading is not finite, at the gyro's limit, or repeats itself
+    CORNERS_MIRRORED = enum.auto()  # they run as of a marker seen from behind: in another order
 
 
 class Reject(enum.IntFlag):
