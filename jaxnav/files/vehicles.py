@@ -154,7 +154,7 @@ def is_base_file(data: Mapping[str, Any]) -> bool:
 
 
 def load_car(path: str | Path) -> Vehicle:
-    """Read the vehicle of what is for cars alone so far: calibrations, tuning, the fault matrix.
+    """Read the vehicle of what is for cars alone so far: calibrations, tuning.
 
     Raises:
         BadInput: as `load_vehicle`; or the vehicle is no Ackermann car, or has a gyro.

@@ -15,6 +15,7 @@ from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.markers import MarkerMap
+from jaxnav.simulation.bases import BASES
 from jaxnav.testing import injections as inject
 from jaxnav.testing.faults import ALL_CAMERAS, BEGIN_S, FaultRow, Happens
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates
@@ -38,7 +39,7 @@ _stops = partial(FaultRow, health=(Health.STOP, Health.STOP))
 def matrix() -> list[FaultRow]:
     """All rows of the matrix."""
     return [
-        FaultRow("none"),
+        FaultRow("none", bases=BASES),
         *_cameras(),
         *_frames(),
         *_stamps(),

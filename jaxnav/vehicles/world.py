@@ -3,6 +3,7 @@
 import math
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -91,6 +92,8 @@ class SimWorld:
         self._written_ns = self._gyro_ns = begin_ns
         self._gyro = None if vehicle.gyro is None else _Gyro.switched_on(vehicle.gyro, seed)
         self._held = False
+        self._acts: Callable[[tuple[float, ...]], tuple[float, ...]] = lambda command: command
+        self._reads: Callable[..., tuple[float, ...]] = lambda read, command: read
 
     def write(self, *told: float) -> None:
         """Take a command, which acts after the actuation delay.
@@ -116,6 +119,20 @@ class SimWorld:
         """Hold the vehicle fast, wheels included, or let it go."""
         with self._lock:
             self._held = held
+
+    def rewire(
+        self,
+        acts: Callable[[tuple[float, ...]], tuple[float, ...]] = lambda command: command,
+        reads: Callable[..., tuple[float, ...]] = lambda read, command: read,
+    ) -> None:
+        """Connect the actuators and the odometer in another way.
+
+        Args:
+            acts: what acts in place of a command.
+            reads: what is read in place of the true reading while a command is obeyed.
+        """
+        with self._lock:
+            self._acts, self._reads = acts, reads
 
     def move_markers(
         self, by_m: tuple[float, float, float], which: slice = slice(None), scale: float = 1.0
@@ -160,7 +177,9 @@ class SimWorld:
 
     def reading(self, at_ns: int) -> Reading:
         """The reading of the odometer at an instant, without corrections."""
-        return reading_of(at_ns, self.odometry(at_ns), valid=True)
+        read = self.odometry(at_ns)
+        with self._lock:
+            return reading_of(at_ns, self._reads(read, self._obeyed(at_ns)), valid=True)
 
     def odometry(self, at_ns: int) -> tuple[float, ...]:
         """The noisy (speed_mps, steering_rad) of a car's sensors, or another base's twist."""
@@ -222,7 +241,7 @@ class SimWorld:
     def _advance(self, until_ns: int) -> None:
         while self._time_ns < until_ns:
             step_ns = min(_SUBSTEP_NS, until_ns - self._time_ns)
-            command = np.array(self._obeyed(self._time_ns), self._dtype)
+            command = np.array(self._acts(self._obeyed(self._time_ns)), self._dtype)
             dt_s = np.asarray(step_ns / 1e9, self._dtype)
             moved = np.asarray(_moved(self._plant, self._row, command, dt_s))
             if self._held:  # it keeps its pose; a car's wheels are steered nevertheless
