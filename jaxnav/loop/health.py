@@ -36,6 +36,7 @@ _SLOW = (
     | Fault.RELOCATED
     | Fault.WAYS_DISPUTED
     | Fault.ODOMETRY_DOUBTFUL
+    | Fault.FILES_CONTRADICTED
 )
 
 
@@ -67,7 +68,7 @@ class Senses:
     faults: Fault  # found elsewhere
     restarts: int = 0  # in the last RESTARTS_S
     confirmed: bool = True  # by corners, more than once (see `support`)
-    refused: bool = False  # the pose is out of reach and not accepted (see `support`)
+    refused: bool = False  # the pose is not to be driven on (see `Support.stands`)
 
 
 @dataclass
@@ -134,7 +135,8 @@ class Monitor:
         blind = without_odometry and senses.fix_age_s > limits.blind_s
         if senses.fix_age_s > limits.stop_s or blind or faults & _LOST:
             return Health.STOP
-        if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted:
+        twins = Fault.DUPLICATE_MARKER in faults and not senses.decided
+        if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted or twins:
             return Health.DEGRADED
         if Fault.NO_MARKER in faults:
             return Health.DEAD_RECKONING

@@ -33,13 +33,14 @@ from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import GyroReading, Reading
 from jaxnav.loop.limits import Command
 from jaxnav.loop.odometer import Odometers
-from jaxnav.loop.outvoted import MarkerVotes
+from jaxnav.loop.outvoted import MarkerVotes, Twins
 from jaxnav.loop.stamps import Stamps
-from jaxnav.loop.standstill import Standstill, Way
+from jaxnav.loop.standstill import Standstill, Way, between
 from jaxnav.loop.support import Support
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
+from jaxnav.pose.candidates import Candidates
 
 SLEPT_NS = 1_000_000_000  # after a pause this long in the loop, its belief is out of date
 GYRO_STALE_S = 0.1  # as the odometer
@@ -189,6 +190,11 @@ class Pilot:
         self._support = Support(self._chassis, relocate)
         self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
+        self._twins = Twins(navigator)
+        centres_m = np.asarray(navigator.markers.Ts_world_marker.translation(), float)
+        self._centres_m = centres_m.tolist()
+        self._lane, self._look_ns = (0, 0), 0  # camera and marker whose range is watched, and when
+        self._on_twins = False  # whether the estimate may be by an id at two places
         self._sure = False  # whether the estimate may judge cameras
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
@@ -207,6 +213,7 @@ class Pilot:
         """Compile the programs without changing the pilot's state."""
         self._estimator.warm_up()
         due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
+        self._twins.warm_up()
 
     def handle(self, given: Input) -> Outcome:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
@@ -219,6 +226,10 @@ class Pilot:
         if data is not None:
             self._judge_cameras(data, stamp_ns)
             data = self._camera_votes.remove_outvoted(data)
+        if data is not None:
+            data = self._twins.remove_twins(data, stamp_ns, self._standstill.way)
+        if self._twins.seen(now_ns):
+            faults |= Fault.DUPLICATE_MARKER
         if data is not None:
             data = self._marker_votes.remove_outvoted(data)
         if data is not None:
@@ -291,13 +302,17 @@ class Pilot:
             self._support.note_restart()
         if data is not None and data.corners_px is not None and not fused.refused:
             self._marker_votes.count(data, np.asarray(fused.output.outvoted))
+            self._add_place(data, stamp_ns, vars(fused.output)["candidates"])
             rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
         doubts = self._support.faults
         faults |= doubts
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
         faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
         faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
-        self._sure = known.decided and self._support.confirmed and not doubts
+        sure = known.decided and self._support.confirmed and not doubts
+        # A fix since then is by other ids.
+        self._on_twins = self._twins.seen(now_ns) and (self._fix_ns or 0) < self._twins.last_ns
+        self._sure = sure and not self._on_twins
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
@@ -364,6 +379,24 @@ class Pilot:
             return Reject.INNOVATION
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
 
+    def _add_place(self, data: EventData, stamp_ns: int, candidates: Candidates) -> None:
+        """Watch how the range of a marker in view changes; see `Ranges`."""
+        visible, valid = data.visible, np.asarray(candidates.valid)
+        assert visible is not None
+        then_ns, way = self._look_ns, self._standstill.way
+        if not valid.any() or stamp_ns <= then_ns:
+            return
+        if not visible[self._lane]:
+            camera, marker = np.argwhere(visible)[0].tolist()
+            self._lane = camera, marker
+        best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
+        T_vehicle_world = np.asarray(candidates.T_vehicle_world.wxyz_xyz)[best].tolist()
+        place_m = _transformed(T_vehicle_world, self._centres_m[self._lane[1]])
+        then, now = way.at(then_ns), way.at(stamp_ns)
+        motion = None if then is None or now is None else between(then, now)
+        if self._support.ranges.add_place(self._lane, place_m, motion):
+            self._look_ns = stamp_ns
+
     def _judge_cameras(self, data: EventData, stamp_ns: int) -> None:
         """Let a sure estimate vote on the cameras in view; see `CameraVotes`."""
         known = self._known
@@ -374,7 +407,8 @@ class Pilot:
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
-        doubt = self._support.doubt(self._monitor.contradicted)
+        contradicted = self._monitor.contradicted or self._on_twins
+        doubt = self._support.doubt(contradicted)
         if not (doubt.is_doubted and known.decided):
             return output, known
         covariances = [np.array(output.pose_covariance), np.array(output.covariance)]
@@ -410,7 +444,7 @@ class Pilot:
             faults=faults,
             restarts=len(self._restarts_ns),
             confirmed=self._support.confirmed,
-            refused=self._support.refused,
+            refused=self._support.stands,
         )
 
     def _age_s(self, stamp_ns: int | None, now_ns: int) -> float:
@@ -453,6 +487,18 @@ def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
     x_m, y_m, psi_rad = map(float, pose[:3])
     sigma_rad = math.sqrt(max(float(covariance[2, 2]), 0.0))
     return Fix(x_m, y_m, psi_rad, root_of_sum(covariance), sigma_rad)
+
+
+def _transformed(wxyz_xyz: list[float], point: list[float]) -> tuple[float, float, float]:
+    """A point moved by a pose; NumPy's own product takes three times as long."""
+    w, a, b, c, *shift = wxyz_xyz
+    x, y, z = point
+    u, v, t = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    return (
+        x + w * u + b * t - c * v + shift[0],
+        y + w * v + c * u - a * t + shift[1],
+        z + w * t + a * v - b * u + shift[2],
+    )
 
 
 def _apart(pose: np.ndarray, other: np.ndarray) -> str:

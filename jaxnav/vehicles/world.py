@@ -145,6 +145,20 @@ class SimWorld:
             self.markers = eqx.tree_at(lambda m: m.size_m, self.markers, size_m)
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
 
+    def copy_markers(self, by: tuple[float, float, float]) -> None:
+        """Somebody hangs up a copy of every marker, moved by (m, m, rad) about the origin."""
+        with self._lock:
+            markers = self.markers
+            Ts = markers.Ts_world_marker.wxyz_xyz
+            turn = T_world_vehicle_from_planar(jnp.asarray(by, Ts.dtype))
+            copies = jax.vmap(lambda T: (turn @ jaxlie.SE3(T)).wxyz_xyz)(Ts)
+            self.markers = MarkerMap(
+                jaxlie.SE3(jnp.concatenate([Ts, copies])),
+                jnp.concatenate([markers.size_m] * 2),
+                markers.ids * 2,
+                markers.families * 2,
+            )
+
     def knock_camera(self, camera: int, turn_rad: tuple[float, float, float]) -> None:
         """Somebody turns a camera about its own axes, by a rotation vector."""
         with self._lock:
