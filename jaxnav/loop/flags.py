@@ -40,6 +40,13 @@ class Fault(enum.IntFlag):
     # The estimate goes on without the gyro, and health stays as it is.
     GYRO_STALE = enum.auto()  # its file says that there is one, and it gave no rate in time
     GYRO_INVALID = enum.auto()  # a reading is not finite, at the gyro's limit, or repeats itself
+    GYRO_CONTRADICTED = enum.auto()  # by the two others that tell the turn: it is left out
+    # What follows a command is not what was commanded: of the throttle or of ahead, of the left,
+    # and of the steering or of the turn.
+    DRIVE_CONTRADICTED = enum.auto()
+    SIDEWAYS_CONTRADICTED = enum.auto()
+    TURN_CONTRADICTED = enum.auto()
+    LEFT_ROUTE = enum.auto()  # farther from it than its file allows
     # Corners come nearer by another way than the odometer tells, from the start: the size of a
     # marker, a focal length, a camera's direction or the wheels are not as their file says.
     FILES_CONTRADICTED = enum.auto()

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
+from jaxnav.loop.actuation import Actuation
 from jaxnav.loop.camera_votes import CameraVotes
 from jaxnav.loop.chassis import chassis_of, pace_mps, root_of_sum
 from jaxnav.loop.corrections import Corrections
@@ -31,12 +32,14 @@ from jaxnav.loop.gyro_track import GyroTrack
 from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
 from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import GyroReading, Reading
+from jaxnav.loop.leaving import Corridor
 from jaxnav.loop.limits import Command
 from jaxnav.loop.odometer import Odometers
 from jaxnav.loop.outvoted import MarkerVotes, Twins
 from jaxnav.loop.stamps import Stamps
 from jaxnav.loop.standstill import Standstill, Way, between
 from jaxnav.loop.support import Support
+from jaxnav.loop.turn_votes import TurnVotes
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
@@ -159,6 +162,7 @@ class Pilot:
         corner_sigma_px: float | None = None,
         relocate: bool = True,
         drives: bool = True,
+        leave_m: float = math.inf,
     ):
         """Args:
         navigator: with a vehicle and waypoints.
@@ -168,6 +172,7 @@ class Pilot:
         relocate: whether to drive on from a pose that no slip explains, slowly at first; else stop.
         drives: whether the commands are the pilot's; else somebody else drives, they are zero, and
             no throttle is known to hold the odometer against.
+        leave_m: how far from its route it may drive, see `Corridor`.
         """
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
@@ -178,8 +183,12 @@ class Pilot:
         self._corrections = Corrections.of(navigator.controller.vehicle)
         gyro = gyro_of(navigator)
         self._gyro = None if gyro is None else GyroTrack(float(gyro.saturation_radps))
-        mean_radps = None if self._gyro is None else self._gyro.mean_radps
+        mean_radps = None if self._gyro is None else self._mean_radps
         self._estimator = Estimator(navigator, program, mean_radps)
+        self._turns: TurnVotes | None = None
+        if self._gyro is not None and gyro is not None:
+            bias_radps = float(gyro.bias_sigma_radps)
+            self._turns = TurnVotes(self._chassis, bias_radps, self._gyro.mean_radps)
         self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._drives = drives
@@ -188,6 +197,8 @@ class Pilot:
         self._standstill = Standstill(Way(self._chassis.lever_m), self._chassis.time_constant_s)
         self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
         self._support = Support(self._chassis, relocate)
+        self._actuation = Actuation(self._chassis)
+        self._corridor = Corridor(navigator.controller.waypoints_m, leave_m)
         self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
         self._twins = Twins(navigator)
@@ -249,6 +260,8 @@ class Pilot:
         if self._odometry_stamps.jumps > jumps:
             faults |= Fault.CLOCK_JUMPED
         driven_mps, motion = chassis.driven_mps(reading), chassis.motion(reading)
+        if self._turns is not None:
+            self._turns.add_reading(now_ns, motion)
         pace = pace_mps(driven_mps)
         believable, faults_seen = self._odometers.judge(
             driven_mps,
@@ -300,12 +313,19 @@ class Pilot:
             self._left = self._known
             self._restarts_ns.append(now_ns)
             self._support.note_restart()
+            if self._turns is not None:
+                self._turns.forget()
         if data is not None and data.corners_px is not None and not fused.refused:
             self._marker_votes.count(data, np.asarray(fused.output.outvoted))
-            self._add_place(data, stamp_ns, vars(fused.output)["candidates"])
-            rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
+            candidates = vars(fused.output)["candidates"]
+            self._add_place(data, stamp_ns, candidates)
+            rejects |= self._judge(known, fused.belief, candidates, stamp_ns, now_ns)
         doubts = self._support.faults
+        if self._drives:
+            doubts |= self._actuation.faults
         faults |= doubts
+        if self._turns is not None and self._turns.gyro_is_wrong:
+            faults |= Fault.GYRO_CONTRADICTED
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
         faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
         faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
@@ -313,6 +333,8 @@ class Pilot:
         # A fix since then is by other ids.
         self._on_twins = self._twins.seen(now_ns) and (self._fix_ns or 0) < self._twins.last_ns
         self._sure = sure and not self._on_twins
+        if self._drives and self._sure and self._corridor.is_left(known.pose[:2]):
+            faults |= Fault.LEFT_ROUTE
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
@@ -352,13 +374,21 @@ class Pilot:
         moves = known.velocity, known.velocity_covariance
         return self._chassis.believed_mps(float(known.pose[2]), *moves)
 
-    def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
+    def _judge(
+        self, known: _Known, belief: Belief, candidates: Candidates, stamp_ns: int, now_ns: int
+    ) -> Reject:
         """Use the corners to confirm or doubt the estimate; return their `Reject` flags."""
         agrees = known.accepted and known.nis <= known.gate_nis
         if not agrees:
             self._camera_votes.note_contradiction(stamp_ns)
         self._monitor.corners(agrees)
         fix = _fix(known.pose, known.pose_covariance) if known.decided else None
+        if fix is None or not agrees:
+            self._actuation.add_headings(now_ns, _headings(candidates))
+        elif self._support.confirmed:
+            self._actuation.add_fix(now_ns, fix)
+            if self._turns is not None:
+                self._turns.add_fix(now_ns, fix.psi_rad)
         bank = belief.bank
         alive = zip(*planar_poses(bank), bank.initialised, strict=True)
         support = self._support
@@ -407,7 +437,8 @@ class Pilot:
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
-        contradicted = self._monitor.contradicted or self._on_twins
+        disobeyed = self._drives and bool(self._actuation.faults)
+        contradicted = self._monitor.contradicted or disobeyed or self._on_twins
         doubt = self._support.doubt(contradicted)
         if not (doubt.is_doubted and known.decided):
             return output, known
@@ -422,6 +453,9 @@ class Pilot:
         return honest, known._replace(pose_covariance=covariances[0])
 
     def _limited(self, known: _Known, health: Health, now_ns: int, elapsed_ns: int) -> Command:
+        for judge in (self._actuation, self._turns):
+            if judge is not None:
+                judge.add_command(self._command, min(elapsed_ns, SLEPT_NS) / 1e9)
         if self._drives:
             wanted = self.limits.slowed(known.command, SPEED_FACTOR[health])
             self._command = self.limits.within(wanted, self._command, elapsed_ns / 1e9)
@@ -444,7 +478,7 @@ class Pilot:
             faults=faults,
             restarts=len(self._restarts_ns),
             confirmed=self._support.confirmed,
-            refused=self._support.stands,
+            refused=self._support.stands or (self._drives and self._actuation.gives_up),
         )
 
     def _age_s(self, stamp_ns: int | None, now_ns: int) -> float:
@@ -470,12 +504,21 @@ class Pilot:
     def _begin_anew(self, reason: str) -> None:
         self._estimator.reset()
         self._support.begin_anew()
+        self._actuation.forget()
+        if self._turns is not None:
+            self._turns.forget()
         self._restarts += 1
         if self._now_ns is not None:
             self._restarts_ns.append(self._now_ns)
         self._restarts_before, self._restart_reason = self._restarts, reason
         self._fix_ns, self._distance_m = None, 0.0
         self._left = self._known
+
+    def _mean_radps(self, begin_ns: int, end_ns: int) -> float:
+        """What the gyro tells of the interval between two times; NaN: nothing, or it is wrong."""
+        assert self._gyro is not None
+        assert self._turns is not None
+        return math.nan if self._turns.gyro_is_wrong else self._gyro.mean_radps(begin_ns, end_ns)
 
     def _seeing(self, now_ns: int) -> bool:
         """Whether recent corners tell how fast the vehicle is."""
@@ -487,6 +530,18 @@ def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
     x_m, y_m, psi_rad = map(float, pose[:3])
     sigma_rad = math.sqrt(max(float(covariance[2, 2]), 0.0))
     return Fix(x_m, y_m, psi_rad, root_of_sum(covariance), sigma_rad)
+
+
+def _headings(candidates: Candidates) -> list[tuple[float, float]]:
+    """Where the vehicle heads by each pose that the corners may mean: psi_rad, sigma_rad."""
+    of = vars(candidates)
+    quaternions, covariances = of["T_vehicle_world"].wxyz_xyz[:, :4], of["covariance"]
+    headings = []
+    for index in np.flatnonzero(of["valid"]).tolist():
+        w, x, y, z = quaternions[index].tolist()
+        psi_rad = math.atan2(2 * (x * y - w * z), 1 - 2 * (y * y + z * z))
+        headings.append((psi_rad, math.sqrt(max(float(covariances[index, 5, 5]), 0.0))))
+    return headings
 
 
 def _transformed(wxyz_xyz: list[float], point: list[float]) -> tuple[float, float, float]:

@@ -170,7 +170,8 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
         waypoint_radius_m=route.waypoint_radius_m,
     )
     program = trial.program and trial.program(strip_static(navigator))
-    pilot = Pilot(navigator, program=program, relocate=row.relocate)
+    leave_m = route.leaves_at_m
+    pilot = Pilot(navigator, program=program, relocate=row.relocate, leave_m=leave_m)
     world = SimWorld(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
     delays = None
     if Fault.CAMERA_LATE in row.faults and isinstance(trial.vehicle, Vehicle):

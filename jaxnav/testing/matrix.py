@@ -49,6 +49,8 @@ def matrix() -> list[FaultRow]:
         *_nonsense(),
         *_spoofed(),
         *_maps(),
+        *_actuators(),
+        *_gyros(),
         # Frames taken earlier than their stamps, which no clock shows: this must be reported, but
         # the estimate's error meanwhile is not limited.
         _may_slow(
@@ -450,4 +452,106 @@ def _maps() -> list[FaultRow]:
         # Maps so far away that float32 resolves only 0.5 m or 1 m there; nothing else is wrong.
         FaultRow("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
         FaultRow("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
+    ]
+
+
+_Numbers = tuple[float, ...]
+
+
+def _signed(*signs: float) -> Callable[[_Numbers], _Numbers]:
+    """Multiply each number of a command or of a reading."""
+    return lambda numbers: tuple(sign * n for sign, n in zip(signs, numbers, strict=True))
+
+
+def _actuators() -> list[FaultRow]:
+    """Rows in which a command moves the vehicle otherwise than it says.
+
+    Each with an odometer that tells the truth, and with one that tells what was commanded: it is
+    wired in the same way, or there is none on that part.
+    """
+    driven = partial(
+        FaultRow, error_m=np.inf, error_after_m=np.inf, health=(Health.STOP, Health.STOP),
+        ends_s=_LATEST, lied_m=0.5, named_m=0.5, slow_m=0.5, stood_m=1.0, drive_s=8.0,
+    )  # fmt: skip
+
+    def wired(
+        name: str,
+        faults: Fault,
+        acts: Callable[[_Numbers], _Numbers],
+        tells: Callable[..., _Numbers],
+        bases: tuple[str, ...],
+    ) -> list[FaultRow]:
+        told = {"true": {}, "told": {"reads": tells}}
+        return [
+            driven(
+                f"{name}, {kind} odometer{begins}",
+                happens=_at(
+                    range(BEGIN_NS + int(begins_s * 1e9), 2**62, 2**62),
+                    lambda world, reads=reads: world.rewire(acts, **reads),
+                ),
+                faults=faults,
+                begins_s=begins_s,
+                bases=bases,
+            )
+            for kind, reads in told.items()
+            for begins_s, begins in ((0.0, " from the start"), (BEGIN_S, ""))
+        ]
+
+    def like(acts: Callable[[_Numbers], _Numbers]) -> Callable[..., _Numbers]:
+        """An odometer that is wired as the motors are."""
+        return lambda read, command: acts(read)
+
+    def swapped(numbers: _Numbers) -> _Numbers:
+        return numbers[1], numbers[0], numbers[2]
+
+    def steered(read: _Numbers, command: _Numbers) -> _Numbers:
+        return read[0], command[0]
+
+    def stuck_at(steering_rad: float) -> Callable[[_Numbers], _Numbers]:
+        return lambda command: (steering_rad, command[1])
+
+    def unsigned(read: _Numbers, command: _Numbers) -> _Numbers:
+        return abs(read[0]), read[1]
+
+    car, bases = ("ackermann",), BASES[1:]
+    drive, left, turn = (
+        Fault.DRIVE_CONTRADICTED, Fault.SIDEWAYS_CONTRADICTED, Fault.TURN_CONTRADICTED
+    )  # fmt: skip
+    ahead, aside, around = _signed(-1, 1, 1), _signed(1, -1, 1), _signed(1, 1, -1)
+    return [
+        *wired("steering reversed", turn, _signed(-1, 1), steered, car),
+        *wired("servo dead at 0", turn, stuck_at(0.0), steered, car),
+        *wired("servo dead at 0.3 rad", turn, stuck_at(0.3), steered, car),
+        *wired("motor reversed", drive, _signed(1, -1), unsigned, car),
+        *wired("ahead reversed", drive, ahead, like(ahead), bases),
+        *wired("left reversed", left, aside, like(aside), ("omni",)),
+        *wired("turn reversed", turn, around, like(around), ("differential",)),
+        *wired("ahead and left swapped", drive | left, swapped, like(swapped), ("omni",)),
+    ]
+
+
+def _gyros() -> list[FaultRow]:
+    """Rows in which a gyro lies from the start, with four seconds in which no marker is seen."""
+
+    def lies(name: str, edit: Callable[[], Callable[[float], float]]) -> FaultRow:
+        def dark() -> Change:
+            blind = inject.frames(inject.nothing_seen)
+            return inject.both(inject.gyro(edit()), inject.between(5.0, 9.0, blind))
+
+        return FaultRow(
+            name, dark, Fault.GYRO_CONTRADICTED | Fault.GYRO_INVALID,
+            health=(Health.OK, Health.STOP), error_m=0.3,
+            begins_s=0.0, ends_s=_LATEST, bases=BASES[:2], gyro=True, lied_m=0.0, named_m=0.5,
+            drive_s=12.0,
+        )  # fmt: skip
+
+    def noisy() -> Callable[[float], float]:
+        rng = np.random.default_rng(0)
+        return lambda rate_radps: rate_radps + float(rng.standard_normal())
+
+    return [
+        lies("a gyro stuck at 0", lambda: lambda rate_radps: 0.0),
+        lies("a gyro of the wrong sign", lambda: lambda rate_radps: -rate_radps),
+        lies("a gyro in degrees", lambda: np.rad2deg),
+        lies("a gyro with 1 rad/s of noise", noisy),
     ]
