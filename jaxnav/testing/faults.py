@@ -14,9 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-import equinox as eqx
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
 
 from jaxnav.compiling.step import strip_static
@@ -66,7 +63,7 @@ class FaultRow:
         begins_s, ends_s: of the fault; inf: it lasts.
         always: the data are changed before `begins_s` too.
         drive_s: duration of the whole drive.
-        telling: how the navigator's rig differs from the true one, see `navigator_rig`.
+        telling: makes the rig of the navigator's file from the true one.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
@@ -89,7 +86,7 @@ class FaultRow:
     always: bool = False
     drive_s: float = 7.0
     rates: Rates = field(default_factory=Rates)
-    telling: str = ""
+    telling: Callable[[CameraRig], CameraRig] = lambda rig: rig
     markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     relocate: bool = True
     well: Health = Health.OK
@@ -163,7 +160,7 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
     markers, route = shift_origin(trial, row.shift_m)
     navigator = Navigator(
-        rig=navigator_rig(trial.rig, row.telling),
+        rig=row.telling(trial.rig),
         markers=markers,
         vehicle=trial.vehicle,
         waypoints_m=route.waypoints_m,
@@ -194,23 +191,6 @@ def shift_origin(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     waypoints_m = points_in_world(WAYPOINTS_M, (x_m, y_m, z_m))
     start_pose = planar_in_world(trial.start_pose, (x_m, y_m, z_m))
     return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
-
-
-def navigator_rig(rig: CameraRig, telling: str) -> CameraRig:
-    """The rig that the navigator gets: the true calibration, or a wrong one."""
-    Ts = rig.Ts_camera_vehicle
-    if telling == "focal":
-        return eqx.tree_at(lambda r: r.cameras.focal_px, rig, 1.02 * rig.cameras.focal_px)
-    if telling == "swapped":
-        order = np.array([0, *range(len(rig) - 1, 0, -1)])
-        return eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, rig, Ts.wxyz_xyz[order])
-    if telling == "extrinsics":
-        directions = np.random.default_rng(0).standard_normal((len(rig), 2, 3))
-        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-        xi = np.concatenate([0.01 * directions[:, 0], np.deg2rad(1.0) * directions[:, 1]], axis=1)
-        moved = Ts @ jaxlie.SE3.exp(jnp.asarray(xi, Ts.wxyz_xyz.dtype))
-        return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, moved)
-    return rig
 
 
 def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -15,6 +16,7 @@ from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
 from jaxnav.simulation.bases import BASES
 from jaxnav.testing import injections as inject
 from jaxnav.testing.faults import ALL_CAMERAS, BEGIN_S, FaultRow, Happens
@@ -45,6 +47,7 @@ def matrix() -> list[FaultRow]:
         *_stamps(),
         *_odometry(),
         *_calibration_and_world(),
+        *_contradicted_files(),
         *_standstill(),
         *_nonsense(),
         *_spoofed(),
@@ -223,6 +226,91 @@ def _at(times_ns: range, act: Callable[[SimWorld], None]) -> Callable[[], Happen
 _once = partial(_at, range(_BEGIN_NS, _BEGIN_NS + 1))
 
 
+def _focal(by: float) -> Callable[[CameraRig], CameraRig]:
+    """A file whose focal lengths are so many times the true ones."""
+    return lambda rig: eqx.tree_at(lambda r: r.cameras.focal_px, rig, by * rig.cameras.focal_px)
+
+
+def _swapped(*order: int) -> Callable[[CameraRig], CameraRig]:
+    """A file that gives each camera the place of another one."""
+
+    def told(rig: CameraRig) -> CameraRig:
+        swapped = rig.Ts_camera_vehicle.wxyz_xyz[np.array(order)]
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, rig, swapped)
+
+    return told
+
+
+def _moved(xi: Callable[[int], np.ndarray]) -> Callable[[CameraRig], CameraRig]:
+    """A file that moves every camera of C by xi, (C, 6) or (6,), in the vehicle's axes."""
+
+    def told(rig: CameraRig) -> CameraRig:
+        Ts = rig.Ts_camera_vehicle
+        by = np.broadcast_to(xi(len(rig)), (len(rig), 6))
+        moved = Ts @ jaxlie.SE3.exp(jnp.asarray(by, Ts.wxyz_xyz.dtype))
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, moved)
+
+    return told
+
+
+def _off_by_hand(cameras: int) -> np.ndarray:
+    """1 cm and 1 deg, in any direction."""
+    directions = np.random.default_rng(0).standard_normal((cameras, 2, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    return np.concatenate([0.01 * directions[:, 0], np.deg2rad(1.0) * directions[:, 1]], axis=1)
+
+
+_misplaced = _moved(_off_by_hand)
+
+
+_FROM_THE_START = range(BEGIN_NS, BEGIN_NS + 1)
+
+
+def _contradicted_files() -> list[FaultRow]:
+    """Rows in which a file, or a copy, contradicts what the vehicle sees from the start."""
+
+    def larger(by: float) -> Callable[[], Happens]:
+        none_m = (0.0, 0.0, 0.0)
+        return _at(_FROM_THE_START, lambda world: world.move_markers(none_m, scale=1 / by))
+
+    lasting = partial(FaultRow, begins_s=0.0, ends_s=_LATEST, bases=BASES[:2])
+    never = partial(lasting, health=(Health.INIT,) * 2, lied_m=0.0, named_m=0.01, drive_s=2.0)
+    told = partial(
+        lasting,
+        faults=Fault.FILES_CONTRADICTED,
+        health=(_SLOW, Health.STOP),
+        error_m=np.inf,
+        lied_m=0.5,
+        drive_s=6.0,
+    )
+    turned = partial(told, named_m=0.3, stood_m=1.2)
+    return [
+        never(
+            "corners listed the other way round",
+            _cornered(lambda c: c[:, ::-1]),
+            Fault.CORNERS_MIRRORED,
+        ),
+        never(
+            "a copy that another camera sees",
+            happens=_at(_FROM_THE_START, lambda world: world.copy_markers((2.0, -1.6, np.pi))),
+            faults=Fault.DUPLICATE_MARKER,
+        ),
+        *(
+            told(f"marker size x{by:g}", happens=larger(by), named_m=at_m, stood_m=at_m + 0.7)
+            for by, at_m in ((2.0, 0.5), (0.5, 0.5), (1.2, 1.5), (0.8, 1.5))
+        ),
+        *(
+            told(f"focal length x{by:g}", telling=_focal(by), named_m=0.5, stood_m=1.2)
+            for by in (1.5, 0.7)
+        ),
+        turned("front and rear camera swapped", telling=_swapped(2, 1, 0, 3)),
+        turned(
+            "rig turned by 180 deg",
+            telling=_moved(lambda _: np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi])),
+        ),
+    ]
+
+
 def _calibration_and_world() -> list[FaultRow]:
     wrong = partial(_may_slow, begins_s=2.0, ends_s=_LATEST, drive_s=6.0)
 
@@ -248,11 +336,11 @@ def _calibration_and_world() -> list[FaultRow]:
         )
 
     return [
-        wrong("cameras off by 1 deg, 1 cm", telling="extrinsics"),
-        wrong("focal length off by 2 %", telling="focal"),
+        wrong("cameras off by 1 deg, 1 cm", telling=_misplaced),
+        wrong("focal length off by 2 %", telling=_focal(1.02)),
         _may_stop(
             "cameras swapped",
-            telling="swapped",
+            telling=_swapped(0, 3, 2, 1),
             # One that shares its view with another is outvoted; one that is alone looks right.
             faults=Fault.CAMERA_OUTVOTED | Fault.RESTARTED,
             error_m=np.inf,
