@@ -104,6 +104,7 @@ class Twins:
         self._dtype = np.asarray(navigator.corner_sigma_px).dtype
         self._corners_px = np.zeros((*shape, 4, 2), self._dtype)
         self._stamps_ns = np.full(shape, _LONG_AGO_NS)
+        self._seen_m = np.zeros((*shape, 3))
         self._agreed = np.zeros(len(rig), bool)
         self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
 
@@ -136,20 +137,24 @@ class Twins:
         self._stamps_ns[visible] = stamp_ns
         recent = np.abs(stamp_ns - self._stamps_ns) < _TOGETHER_NS
         shared = visible.any(axis=0) & (recent.sum(axis=0) > 1)
-        if shared.any():
-            seen_m = np.asarray(sighted_places(self._rig, self._size_m, self._corners_px), float)
+        if shared.any() or visible.any(axis=1).sum() > 1:
+            places_m = sighted_places(self._rig, self._size_m, self._corners_px)
+            self._seen_m = np.asarray(places_m, float)
             for marker in np.flatnonzero(shared).tolist():
-                self._compare(marker, np.flatnonzero(recent[:, marker]), seen_m, stamp_ns, way)
+                self._compare(marker, np.flatnonzero(recent[:, marker]), stamp_ns, way)
         twins = (self._votes >= _LASTING) | (np.abs(stamp_ns - self._last_ns) < _TOGETHER_NS)
         return data.hiding(np.broadcast_to(twins, visible.shape)) if twins.any() else data
 
-    def _compare(
-        self, marker: int, cameras: np.ndarray, seen_m: np.ndarray, stamp_ns: int, way: Way
-    ) -> None:
+    def place_m(self, camera: int, marker: int) -> list[float]:
+        """Where a sighting has its marker; known while several cameras are in view."""
+        place_m: list[float] = self._seen_m[camera, marker].tolist()
+        return place_m
+
+    def _compare(self, marker: int, cameras: np.ndarray, stamp_ns: int, way: Way) -> None:
         now = way.at(stamp_ns)
         places_m: list[tuple[int, np.ndarray]] = []
         for camera in cameras.tolist():
-            then_ns, at_m = int(self._stamps_ns[camera, marker]), seen_m[camera, marker]
+            then_ns, at_m = int(self._stamps_ns[camera, marker]), self._seen_m[camera, marker]
             if then_ns != stamp_ns:
                 then = way.at(then_ns)
                 if now is None or then is None:

@@ -419,9 +419,13 @@ class Pilot:
         if not visible[self._lane]:
             camera, marker = np.argwhere(visible)[0].tolist()
             self._lane = camera, marker
-        best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
-        T_vehicle_world = np.asarray(candidates.T_vehicle_world.wxyz_xyz)[best].tolist()
-        place_m = _transformed(T_vehicle_world, self._centres_m[self._lane[1]])
+        if visible.any(axis=1).sum() > 1:
+            # Of several cameras the pose is theirs together: their places tell its range.
+            place_m = self._twins.place_m(*self._lane)
+        else:
+            best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
+            T_vehicle_world = np.asarray(candidates.T_vehicle_world.wxyz_xyz)[best].tolist()
+            place_m = _transformed(T_vehicle_world, self._centres_m[self._lane[1]])
         then, now = way.at(then_ns), way.at(stamp_ns)
         motion = None if then is None or now is None else between(then, now)
         if self._support.ranges.add_place(self._lane, place_m, motion):
@@ -544,16 +548,16 @@ def _headings(candidates: Candidates) -> list[tuple[float, float]]:
     return headings
 
 
-def _transformed(wxyz_xyz: list[float], point: list[float]) -> tuple[float, float, float]:
+def _transformed(wxyz_xyz: list[float], point: list[float]) -> list[float]:
     """A point moved by a pose; NumPy's own product takes three times as long."""
     w, a, b, c, *shift = wxyz_xyz
     x, y, z = point
     u, v, t = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
-    return (
+    return [
         x + w * u + b * t - c * v + shift[0],
         y + w * v + c * u - a * t + shift[1],
         z + w * t + a * v - b * u + shift[2],
-    )
+    ]
 
 
 def _apart(pose: np.ndarray, other: np.ndarray) -> str:

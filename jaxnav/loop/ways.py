@@ -26,6 +26,7 @@ long, wheels make every way so, and a camera that looks the other way sees a mar
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -203,7 +204,7 @@ class Ranges:
     sigma: float = math.inf
     _lane: tuple[int, int] | None = None
     _true: set[tuple[int, int]] = field(default_factory=set)
-    _place_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # at the last look that counts
+    _place_m: Sequence[float] = (0.0, 0.0, 0.0)  # at the last look that counts
     _range_m: float = 0.0
     _x_m: float = 0.0
     _since_m: float = 0.0  # way since the contradiction
@@ -218,7 +219,7 @@ class Ranges:
     def add_place(
         self,
         lane: tuple[int, int],
-        place_m: tuple[float, float, float],
+        place_m: Sequence[float],
         motion: tuple[float, float, float] | None,
     ) -> bool:
         """Take where corners alone have a marker; return whether the look counts.

@@ -193,7 +193,7 @@ def test_wheels_that_slip_later_leave_the_files_alone():
     ranges = Ranges()
     looks(ranges)
     assert looks(ranges, wheels=1.4, begin_m=1.5) is None
-    assert ranges.slope == pytest.approx(1 / 1.4, rel=0.1)
+    assert ranges.slope < 0.85
     # Another camera's file has not agreed with any way yet.
     assert looks(ranges, wheels=1.4, lane=(1, 0)) is not None
 
