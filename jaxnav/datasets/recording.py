@@ -15,11 +15,13 @@ Conventions of the existing recordings, as found in their data:
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxnav.detection.observe import double_area_px2
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.models.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
@@ -162,8 +164,10 @@ def assemble(
         imu: on the vehicle.
 
     Raises:
-        BadInput: two families share an id in the map; the detections do not tell families.
+        BadInput: two families share an id in the map, the detections do not tell families; or
+            corners are in another order than they should be.
     """
+    check_winding(name, rows.corners_px[:, TO_OURS])
     if len(set(markers.ids)) < len(markers.ids):
         raise BadInput("--markers", "ids must differ: the recording does not tell families")
     stamps = np.unique(rows.frame_stamps_ns)
@@ -194,6 +198,21 @@ def assemble(
         unmapped_detections=int(np.sum(~mapped)),
         dropped_detections=int(np.sum(mapped)) - len(used),
     )
+
+
+def check_winding(where: str | Path, corners_px: Float[np.ndarray, "N 4 2"]) -> None:
+    """Check that most detections of a file list their corners TL TR BR BL, not TR TL BL BR.
+
+    Some may be noise: where markers are seen edge-on, or where there is none.
+
+    Raises:
+        BadInput: they do not.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # what is out of range is left out later
+        mirrored = int(np.sum(double_area_px2(corners_px) < 0))
+    if 2 * mirrored > len(corners_px):
+        problem = f"of {len(corners_px)} detections {mirrored} list their corners the other way"
+        raise BadInput(where, f"{problem} round, as of markers seen from behind (see first_corner)")
 
 
 def _align(stamps_ns: np.ndarray, poses: dict[int, np.ndarray]) -> Reference:

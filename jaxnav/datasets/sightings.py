@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.datasets.recording import TO_OURS
+from jaxnav.datasets.recording import TO_OURS, check_winding
 from jaxnav.datasets.recordings import read_source
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
@@ -62,9 +62,10 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSi
     stamps_ns, frame = np.unique(rows.stamps_ns, return_inverse=True)
     corners_px = rows.corners_px[:, TO_OURS]
     return _once(
+        path,
         RecordedSightings(
             source.rig, None, stamps_ns, frame, rows.cameras, rows.ids, corners_px, None, ()
-        )
+        ),
     )
 
 
@@ -92,6 +93,7 @@ def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
         stamps_ns.append(max(one.stamp_ns for one in seen))
     frame, camera, ids = (np.array([row[k] for row in rows], int) for k in range(3))
     return _once(
+        path,
         RecordedSightings(
             rig=rig or setup.rig,
             markers=setup.markers,
@@ -104,12 +106,13 @@ def _of_drive(path: Path, rig: CameraRig | None) -> RecordedSightings:
             odometry=tuple(
                 given.odometry for given in log.inputs if isinstance(given.odometry, Odometry)
             ),
-        )
+        ),
     )
 
 
-def _once(seen: RecordedSightings) -> RecordedSightings:
+def _once(path: Path, seen: RecordedSightings) -> RecordedSightings:
     """The sightings with corners in range of markers that a camera reports once in a frame."""
+    check_winding(path, seen.corners_px)
     frame, camera, ids, families = seen.frame, seen.camera, seen.ids, seen.families
     named = np.array(families if families is not None else [""] * len(ids), str)
     keys = np.rec.fromarrays([frame, camera, ids, named])

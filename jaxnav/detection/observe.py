@@ -11,6 +11,8 @@ from jaxnav.detection.types import Detections
 from jaxnav.models.markers import MarkerMap
 
 SAME_PX = 1.0  # two detections nearer to each other than this count as one
+# Of a marker seen edge-on noise may turn the corners round, by its sigmas once in three million.
+_MIRRORED_SIGMAS = 5.0
 
 
 class CornerLanes(NamedTuple):
@@ -22,6 +24,7 @@ class CornerLanes(NamedTuple):
         sigma_px: (C, M, 4), standard deviation of each corner along one axis.
         unknown: number of detections of markers that are not in the map.
         duplicates: number of detections dropped because their image shows their id elsewhere too.
+        mirrored: number of detections dropped because their corners run as from behind.
     """
 
     corners_px: Float[np.ndarray, "C M 4 2"]
@@ -29,6 +32,7 @@ class CornerLanes(NamedTuple):
     sigma_px: Float[np.ndarray, "C M 4"]
     unknown: int
     duplicates: int
+    mirrored: int
 
 
 def marker_keys(markers: MarkerMap) -> tuple[tuple[str, int], ...]:
@@ -36,12 +40,41 @@ def marker_keys(markers: MarkerMap) -> tuple[tuple[str, int], ...]:
     return tuple(zip(markers.families, map(int, markers.ids), strict=True))
 
 
+def double_area_px2(corners_px: Float[np.ndarray, "*N 4 2"]) -> Float[np.ndarray, "*N"]:
+    """Twice the area that corners TL TR BR BL go round, px^2: the product of the diagonals.
+
+    It is positive for whoever sees the print, whatever lens and roll the camera has: on the screen,
+    whose y axis points down, these corners run clockwise. It is negative where a detector lists
+    them the other way round.
+    """
+    (right, down), (left, up) = _diagonals_px(corners_px)
+    return right * up - down * left
+
+
+def _diagonals_px(corners_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """TL to BR and TR to BL, (2, *N) each."""
+    x_y = np.moveaxis(corners_px, -1, 0)
+    return x_y[..., 2] - x_y[..., 0], x_y[..., 3] - x_y[..., 1]
+
+
+def are_mirrored(
+    corners_px: Float[np.ndarray, "N 4 2"], sigma_px: Float[np.ndarray, "N 4"]
+) -> Bool[np.ndarray, " N"]:
+    """Whether corners run as of a marker seen from behind, beyond their noise."""
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found elsewhere
+        falling, rising = (np.sum(line**2, axis=0) for line in _diagonals_px(corners_px))
+        of_tl, of_tr, of_br, of_bl = np.moveaxis(sigma_px**2, -1, 0)
+        variance = (of_tl + of_br) * rising + (of_tr + of_bl) * falling
+        return double_area_px2(corners_px) < -_MIRRORED_SIGMAS * np.sqrt(variance)
+
+
 def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes:
     """The observation of one instant from one `Detections` a camera, in the rig's order.
 
     A marker found at two places in one image is dropped: the map has it once, so one of the two
     is a copy or a reflection, and nothing in the image says which. A marker reported twice at the
-    same place is kept once.
+    same place is kept once. Whoever sees a marker's print sees its corners run clockwise: those
+    that run the other way round are in another order than ours, and dropped.
     """
     # The map's own method would be slower: equinox wraps it in a module at every call, 0.1 ms.
     lanes = {key: lane for lane, key in enumerate(zip(markers.ids, markers.families, strict=True))}
@@ -49,13 +82,14 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
     corners_px = np.zeros((*shape, 4, 2))
     visible = np.zeros(shape, bool)
     sigma_px = np.ones((*shape, 4))
-    unknown = duplicates = 0
+    unknown = duplicates = mirrored = 0
     for camera, sightings in enumerate(detections):
         if not len(sightings):
             continue
         keys = list(zip(sightings.ids.tolist(), sightings.families, strict=True))
         kept = _once_each(keys, sightings.corners_px)
         counts = Counter(keys[k] for k in kept)
+        from_behind = are_mirrored(sightings.corners_px, sightings.sigma_px)
         for k in kept:
             key = keys[k]
             marker = lanes.get(key)
@@ -63,11 +97,13 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
                 unknown += 1
             elif counts[key] > 1:
                 duplicates += 1
+            elif from_behind[k]:
+                mirrored += 1
             else:
                 corners_px[camera, marker] = sightings.corners_px[k]
                 sigma_px[camera, marker] = sightings.sigma_px[k]
                 visible[camera, marker] = True
-    return CornerLanes(corners_px, visible, sigma_px, unknown, duplicates)
+    return CornerLanes(corners_px, visible, sigma_px, unknown, duplicates, mirrored)
 
 
 def _once_each(keys: Sequence[tuple[int, str]], corners_px: np.ndarray) -> list[int]:

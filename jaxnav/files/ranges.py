@@ -65,7 +65,7 @@ RANGES: dict[str, Range] = {
     "position_m": Range(-1e8, 1e8, "m", "place in the world: UTM's northings end at 1e7"),
     "angle_deg": Range(-3600.0, 3600.0, "deg", "angle: ten turns"),
     "angle_rad": Range(-63.0, 63.0, "rad", "angle: ten turns"),
-    "radius_m": Range(1e-3, 1e5, "m", "how near a waypoint must be passed"),
+    "radius_m": Range(1e-3, 1e5, "m", "how near a waypoint is passed, how far a route left"),
     # Vehicles.
     "wheelbase_m": Range(1e-2, 100.0, "m", "wheelbase: a toy's to a mining truck's"),
     "steering_limit_rad": Range(1e-3, math.pi / 2, "rad", "steering limit: below a right angle"),

@@ -3,7 +3,7 @@
 wheelbase_m: 0.256                     start: {x_m: 2.0, y_m: -1.0, psi_deg: 125.0}
 steering_limit_rad: 0.5                waypoints_m: [[1.30, 0.0], [0.50, 0.65]]
 steering_rate_limit_radps: 5.0         waypoint_radius_m: 0.15
-throttle_limit: 0.3
+throttle_limit: 0.3                    leave_m: 3.0   # stop beyond; this key may be left out
 speed_per_throttle_mps: 10.0
 speed_time_constant_s: 0.3
 
@@ -25,6 +25,7 @@ A base that is no car, and a gyro: see `bases.py`.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -116,6 +117,7 @@ class RouteFile(Entry):
 
     waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
     waypoint_radius_m: Radius
+    leave_m: Radius | None = None
     start: StartEntry
 
 
@@ -126,6 +128,16 @@ class Route:
     waypoints_m: tuple[tuple[float, float], ...]  # (N, 2) x y
     waypoint_radius_m: float  # a waypoint is reached within this
     start_pose: tuple[float, float, float]  # (x m, y m, psi rad) where a simulated drive starts
+    leave_m: float | None = None  # see `leaves_at_m`
+
+    @property
+    def leaves_at_m(self) -> float:
+        """How far from its route the vehicle may drive: what the file says, or enough to turn round
+        at each waypoint, 1.5 times the longest leg, the one from the start included, and 1 m."""
+        if self.leave_m is not None:
+            return self.leave_m
+        corners_m = [self.start_pose[:2], *self.waypoints_m]
+        return 1.0 + 1.5 * max(math.dist(*leg) for leg in pairwise(corners_m))
 
     def relative_to(self, origin_m: Origin) -> "Route":
         """The route in the coordinates of a map with this origin, see `MarkerMap`."""
@@ -136,6 +148,7 @@ class Route:
             tuple((float(x), float(y)) for x, y in waypoints_m),
             self.waypoint_radius_m,
             (float(x_m), float(y_m), float(psi_rad)),
+            self.leave_m,
         )
 
 
@@ -170,7 +183,7 @@ def is_base_file(data: Mapping[str, Any]) -> bool:
 
 
 def load_car(path: str | Path) -> Vehicle:
-    """Read the vehicle of what is for cars alone so far: calibrations, tuning, the fault matrix.
+    """Read the vehicle of what is for cars alone so far: calibrations, tuning.
 
     Raises:
         BadInput: as `load_vehicle`; or the vehicle is no Ackermann car, or has a gyro.
@@ -258,4 +271,5 @@ def load_route(path: str | Path) -> Route:
         waypoints_m=tuple((x, y) for x, y in entry.waypoints_m),
         waypoint_radius_m=entry.waypoint_radius_m,
         start_pose=(entry.start.x_m, entry.start.y_m, math.radians(entry.start.psi_deg)),
+        leave_m=entry.leave_m,
     )

@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import Odometry, Reading, TwistOdometry
 from jaxnav.loop.limits import Command, Limits, TwistLimits, turns_by_twist
 from jaxnav.models.bicycle import Vehicle
@@ -28,6 +29,15 @@ from jaxnav.models.twist_base import TwistBase
 # A rim is not farther from the middle than this: a slow turn limit says nothing of the size.
 _WIDEST_M = 0.5
 
+# How exactly a command is followed, see `Part`. The throttle as in `propulsion`; what is commanded
+# in m/s, rad/s or rad is regulated, or a servo's.
+_THROTTLE_FACTOR, _FACTOR = 2.0, 1.5
+_SERVO_S = 0.15  # a servo's lag, with that of a bus
+# Errors of the corners and of the filter, with cameras off by 1 degree or 2 %: as in `ways`.
+_MARGIN_M, _SLACK = 0.1, 0.1
+# Six degrees; and a steering that is trimmed 1.5 degrees off, wheels that are 3 % apart.
+_MARGIN_RAD, _SLACK_RADPM = 0.1, 0.1
+
 
 class Motion(NamedTuple):
     """A velocity in the vehicle's own axes."""
@@ -35,6 +45,28 @@ class Motion(NamedTuple):
     forward_mps: float
     left_mps: float
     turn_radps: float
+
+
+class Part(NamedTuple):
+    """One part of a command, and how exactly it must be followed.
+
+    Attributes:
+        fault: its name where it is not.
+        turns: its motion is a turn, rad; else a way, m.
+        by_way: what is commanded is a curvature, 1/m; else a rate.
+        lag_s: time constant with which it follows.
+        factor: of its gain, either way.
+        margin: of a motion, m or rad, beside what the factor leaves.
+        slack_per_m: what else it may be off for each metre of way.
+    """
+
+    fault: Fault
+    turns: bool
+    by_way: bool
+    lag_s: float
+    factor: float
+    margin: float
+    slack_per_m: float
 
 
 class Chassis(Protocol):
@@ -46,10 +78,13 @@ class Chassis(Protocol):
         time_constant_s: of the lag from a command to the speed.
         lever_m: way of the rim by a turn of 1 rad; 0 of a car, which does not turn on the spot.
         slides_m: way on which the wheels may turn the vehicle by 1 rad where they slide.
+        parts: of a command.
     """
 
     @property
     def limits(self) -> Limits | TwistLimits: ...
+    @property
+    def parts(self) -> tuple[Part, ...]: ...
     @property
     def tops_mps(self) -> tuple[float, ...]: ...
     @property
@@ -73,6 +108,14 @@ class Chassis(Protocol):
 
     def wanted_mps(self, command: Command) -> tuple[float, ...]:
         """The speed towards which a command drives each driven part."""
+        ...
+
+    def targets(self, command: Command) -> tuple[float, ...]:
+        """The rate or curvature that a command makes due of each part."""
+        ...
+
+    def seen(self, moved: Motion) -> tuple[float, ...]:
+        """The part of a motion, m or rad, that each part has made."""
         ...
 
     def believed_mps(
@@ -142,6 +185,25 @@ class CarChassis:
         """See `Chassis`."""
         return (command[1] * self.speed_per_throttle_mps,)
 
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """See `Chassis`: throttle and steering."""
+        lag_s, factor = self.time_constant_s, _THROTTLE_FACTOR
+        return (
+            Part(Fault.DRIVE_CONTRADICTED, False, False, lag_s, factor, _MARGIN_M, _SLACK),
+            Part(Fault.TURN_CONTRADICTED, True, True, _SERVO_S, _FACTOR, _MARGIN_RAD, _SLACK_RADPM),
+        )
+
+    def targets(self, command: Command) -> tuple[float, ...]:
+        """See `Chassis`: speed and curvature."""
+        along = car_motion(1.0, command[0], self.wheelbase_m)
+        return *self.wanted_mps(command), along.turn_radps
+
+    def seen(self, moved: Motion) -> tuple[float, ...]:
+        """See `Chassis`: the way along its course, and the turn."""
+        way_m = math.copysign(math.hypot(moved[0], moved[1]), moved.forward_mps)
+        return way_m, moved.turn_radps
+
     def believed_mps(
         self,
         heading_rad: float,
@@ -201,6 +263,29 @@ class BaseChassis:
         """See `Chassis`."""
         forward_mps, left_mps, turn_radps = command
         return forward_mps, left_mps, turn_radps * self.lever_m
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """See `Chassis`: ahead, to the left and the turn."""
+        lag_s = self.time_constant_s
+        ahead, aside, turn = (
+            Fault.DRIVE_CONTRADICTED,
+            Fault.SIDEWAYS_CONTRADICTED,
+            Fault.TURN_CONTRADICTED,
+        )
+        return (
+            Part(ahead, False, False, lag_s, _FACTOR, _MARGIN_M, _SLACK),
+            Part(aside, False, False, lag_s, _FACTOR, _MARGIN_M, _SLACK),
+            Part(turn, True, False, lag_s, _FACTOR, _MARGIN_RAD, _SLACK_RADPM),
+        )
+
+    def targets(self, command: Command) -> tuple[float, ...]:
+        """See `Chassis`."""
+        return command
+
+    def seen(self, moved: Motion) -> tuple[float, ...]:
+        """See `Chassis`."""
+        return moved
 
     def believed_mps(
         self,

@@ -12,7 +12,7 @@ class Fault(enum.IntFlag):
     # A picture repeats under new stamps, or does not change while the odometer goes.
     FRAME_FROZEN = enum.auto()
     UNKNOWN_MARKER = enum.auto()
-    DUPLICATE_MARKER = enum.auto()  # one id at several places in an image
+    DUPLICATE_MARKER = enum.auto()  # one id at several places, in an image or by several cameras
     CORNERS_NOT_FINITE = enum.auto()
     STAMP_INVALID = enum.auto()  # repeated, in the future, too old, zero or negative
     CLOCK_JUMPED = enum.auto()  # the clock of a source has jumped, or the loop itself slept
@@ -40,6 +40,17 @@ class Fault(enum.IntFlag):
     # The estimate goes on without the gyro, and health stays as it is.
     GYRO_STALE = enum.auto()  # its file says that there is one, and it gave no rate in time
     GYRO_INVALID = enum.auto()  # a reading is not finite, at the gyro's limit, or repeats itself
+    GYRO_CONTRADICTED = enum.auto()  # by the two others that tell the turn: it is left out
+    # What follows a command is not what was commanded: of the throttle or of ahead, of the left,
+    # and of the steering or of the turn.
+    DRIVE_CONTRADICTED = enum.auto()
+    SIDEWAYS_CONTRADICTED = enum.auto()
+    TURN_CONTRADICTED = enum.auto()
+    LEFT_ROUTE = enum.auto()  # farther from it than its file allows
+    # Corners come nearer by another way than the odometer tells, from the start: the size of a
+    # marker, a focal length, a camera's direction or the wheels are not as their file says.
+    FILES_CONTRADICTED = enum.auto()
+    CORNERS_MIRRORED = enum.auto()  # they run as of a marker seen from behind: in another order
 
 
 class Reject(enum.IntFlag):

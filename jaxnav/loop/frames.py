@@ -100,6 +100,8 @@ class FrameIntake:
             faults |= Fault.UNKNOWN_MARKER
         if seen.duplicates:
             faults |= Fault.DUPLICATE_MARKER
+        if seen.mirrored:
+            faults |= Fault.CORNERS_MIRRORED
         if not _are_finite(seen.corners_px, seen.sigma_px):
             faults |= Fault.CORNERS_NOT_FINITE
             for lane in zip(*np.nonzero(seen.visible), strict=True):

@@ -24,6 +24,9 @@ from jaxnav.loop.stamps import Stamps
 GAP_NS = 50_000_000
 _KEPT_NS = 1_500_000_000  # more than the age of the oldest event that is fused, see `stamps`
 STUCK_AFTER = 25  # readings to the last bit alike, other than zero: a sensor's noise is never so
+# White noise of as many, which a sensor of cars has fifty times less of, and the most that a single
+# reading counts for: one that is odd is not yet noise.
+_NOISE_RADPS, _MOST_RADPS = 0.3, 1.5
 
 
 class _Sample(NamedTuple):
@@ -46,6 +49,7 @@ class GyroTrack:
         self._newest_ns: int | None = None  # of all that was told, usable or not
         self._part = 0
         self._raw_radps, self._alike = math.nan, 0
+        self._before_radps, self._noise_rad2ps2 = math.nan, 0.0
 
     @property
     def newest_ns(self) -> int | None:
@@ -92,8 +96,15 @@ class GyroTrack:
         """Whether a reading is a rate: finite, below the limit, and not stuck."""
         alike = turn_radps == self._raw_radps and turn_radps != 0
         self._alike = self._alike + 1 if alike else 0
-        self._raw_radps = turn_radps
-        return abs(turn_radps) < self._saturation_radps and self._alike < STUCK_AFTER
+        # (1, -2, 1) of white noise of sigma s has the variance 6 s^2.
+        bend_radps = (turn_radps - 2 * self._raw_radps + self._before_radps) / math.sqrt(6)
+        if math.isfinite(bend_radps):
+            bend_radps = min(abs(bend_radps), _MOST_RADPS)
+            self._noise_rad2ps2 += (bend_radps**2 - self._noise_rad2ps2) / STUCK_AFTER
+        self._raw_radps, self._before_radps = turn_radps, self._raw_radps
+        is_smooth = self._noise_rad2ps2 < _NOISE_RADPS**2
+        is_alive = self._alike < STUCK_AFTER
+        return abs(turn_radps) < self._saturation_radps and is_alive and is_smooth
 
     def _at(self, stamp_ns: int) -> _Sample | None:
         """The track at a time, interpolated, or held after its newest reading; None: not known."""

@@ -28,7 +28,7 @@ SPEED_FACTOR = {
 
 _NO_FAULT = Fault(0)
 _BROKEN = Fault.NOT_FINITE | Fault.VEHICLE_FAILED | Fault.NOTHING_MOVES | Fault.RESTARTED_OFTEN
-_LOST = Fault.UNSURE | Fault.FAR_FROM_FIX
+_LOST = Fault.UNSURE | Fault.FAR_FROM_FIX | Fault.LEFT_ROUTE
 _SLOW = (
     Fault.CAMERAS_STALE
     | Fault.ODOMETRY_STALE
@@ -36,6 +36,10 @@ _SLOW = (
     | Fault.RELOCATED
     | Fault.WAYS_DISPUTED
     | Fault.ODOMETRY_DOUBTFUL
+    | Fault.DRIVE_CONTRADICTED
+    | Fault.SIDEWAYS_CONTRADICTED
+    | Fault.TURN_CONTRADICTED
+    | Fault.FILES_CONTRADICTED
 )
 
 
@@ -67,7 +71,8 @@ class Senses:
     faults: Fault  # found elsewhere
     restarts: int = 0  # in the last RESTARTS_S
     confirmed: bool = True  # by corners, more than once (see `support`)
-    refused: bool = False  # the pose is out of reach and not accepted (see `support`)
+    # The pose is not to be driven on (see `Support.stands`), or it does not do what it is told.
+    refused: bool = False
 
 
 @dataclass
@@ -134,7 +139,8 @@ class Monitor:
         blind = without_odometry and senses.fix_age_s > limits.blind_s
         if senses.fix_age_s > limits.stop_s or blind or faults & _LOST:
             return Health.STOP
-        if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted:
+        twins = Fault.DUPLICATE_MARKER in faults and not senses.decided
+        if senses.fix_age_s > limits.slow_s or faults & _SLOW or self.contradicted or twins:
             return Health.DEGRADED
         if Fault.NO_MARKER in faults:
             return Health.DEAD_RECKONING

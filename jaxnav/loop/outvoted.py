@@ -1,12 +1,27 @@
-"""Remember markers that the others have outvoted, and hide them when too few are in view."""
+"""Leave out markers that others contradict, and ids that cameras see at contradicting places."""
 
+import math
+from itertools import combinations
+
+import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool, Float
 
+from jaxnav.compiling.executables import kept
 from jaxnav.loop.history import EventData
+from jaxnav.loop.standstill import Way, between
+from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator
 from jaxnav.pose.consistency import LEAST_MARKERS
+from jaxnav.pose.ippe import ippe_from_rays
 
 _OFTEN = 10  # frames with a contradiction by the others minus frames without one
+_TOGETHER_NS = 500_000_000  # cameras that take turns look within this time
+# Two cameras may see a marker this share of its distance apart: 17 degrees, where the filter learns
+# of a camera that is off by 10, or a range that differs by 30 %; and cameras measured by hand.
+_APART_SHARE, _APART_M = 0.3, 0.05
+_LASTING = 5  # frames after which only cameras that agree give the id back: as `CameraVotes`
+_LONG_AGO_NS = -(1 << 62)
 
 
 class MarkerVotes:
@@ -47,3 +62,113 @@ class MarkerVotes:
         if in_view.sum() >= LEAST_MARKERS or not hidden.any():
             return data
         return data.hiding(np.broadcast_to(hidden, data.visible.shape))
+
+
+@kept
+def sighted_places(
+    rig: CameraRig, size_m: Float[Array, " M"], corners_px: Float[Array, "C M 4 2"]
+) -> Float[Array, "C M 3"]:
+    """Where each sighting by itself has its marker's centre in the vehicle's frame, m.
+
+    The two poses of a square differ in how it is turned, not in where it is.
+    """
+
+    def one(camera: int, corners_px: Array, size_m: Array) -> Array:
+        lens, T_camera_vehicle = jax.tree.map(
+            lambda leaf: leaf[camera], (rig.cameras, rig.Ts_camera_vehicle)
+        )
+        Ts_camera_marker = ippe_from_rays(lens.unproject(corners_px), size_m)
+        place_m: Array = T_camera_vehicle.inverse() @ Ts_camera_marker.translation()[0]
+        return place_m
+
+    each = jax.vmap(jax.vmap(one, (None, 0, 0)), (0, 0, None))
+    places_m: Array = each(np.arange(len(rig)), corners_px, size_m)
+    return places_m
+
+
+class Twins:
+    """A drive's watch for one id that two cameras see at contradicting places: a copy, a mirror.
+
+    Nothing in such a frame says which is right, or whether a camera is not where its file says. So
+    the id is left out of all cameras. Two cameras that have agreed before are another matter: one
+    of them was knocked, which the estimate judges (see `CameraVotes`).
+
+    Attributes:
+        contradicted_ns: stamp of the last contradiction.
+    """
+
+    def __init__(self, navigator: Navigator):
+        rig, markers = navigator.rig, navigator.markers
+        shape = len(rig), len(markers.ids)
+        self._rig, self._size_m = rig, markers.size_m
+        self._dtype = np.asarray(navigator.corner_sigma_px).dtype
+        self._corners_px = np.zeros((*shape, 4, 2), self._dtype)
+        self._stamps_ns = np.full(shape, _LONG_AGO_NS)
+        self._seen_m = np.zeros((*shape, 3))
+        self._agreed = np.zeros(len(rig), bool)
+        self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
+
+    def warm_up(self) -> None:
+        """Compile the program without changing anything."""
+        if len(self._rig) > 1:
+            sighted_places(self._rig, self._size_m, self._corners_px)
+
+    def seen(self, now_ns: int) -> bool:
+        """Whether there are such ids."""
+        return bool(self._votes.max() >= _LASTING or now_ns - self.last_ns < _TOGETHER_NS)
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last contradiction."""
+        return int(self._last_ns.max())
+
+    def remove_twins(self, data: EventData, stamp_ns: int, way: Way) -> EventData | None:
+        """The data without ids at contradicting places; None where that leaves nothing.
+
+        Args:
+            way: of the vehicle by its odometer, which has moved between looks.
+        """
+        assert data.corners_px is not None
+        assert data.visible is not None
+        visible = data.visible
+        if len(visible) < 2:
+            return data
+        self._corners_px[visible] = data.corners_px[visible]
+        self._stamps_ns[visible] = stamp_ns
+        recent = np.abs(stamp_ns - self._stamps_ns) < _TOGETHER_NS
+        shared = visible.any(axis=0) & (recent.sum(axis=0) > 1)
+        if shared.any() or visible.any(axis=1).sum() > 1:
+            places_m = sighted_places(self._rig, self._size_m, self._corners_px)
+            self._seen_m = np.asarray(places_m, float)
+            for marker in np.flatnonzero(shared).tolist():
+                self._compare(marker, np.flatnonzero(recent[:, marker]), stamp_ns, way)
+        twins = (self._votes >= _LASTING) | (np.abs(stamp_ns - self._last_ns) < _TOGETHER_NS)
+        return data.hiding(np.broadcast_to(twins, visible.shape)) if twins.any() else data
+
+    def place_m(self, camera: int, marker: int) -> list[float]:
+        """Where a sighting has its marker; known while several cameras are in view."""
+        place_m: list[float] = self._seen_m[camera, marker].tolist()
+        return place_m
+
+    def _compare(self, marker: int, cameras: np.ndarray, stamp_ns: int, way: Way) -> None:
+        now = way.at(stamp_ns)
+        places_m: list[tuple[int, np.ndarray]] = []
+        for camera in cameras.tolist():
+            then_ns, at_m = int(self._stamps_ns[camera, marker]), self._seen_m[camera, marker]
+            if then_ns != stamp_ns:
+                then = way.at(then_ns)
+                if now is None or then is None:
+                    continue
+                x_m, y_m, psi_rad = between(then, now)
+                c, s = math.cos(psi_rad), math.sin(psi_rad)
+                ahead_m, left_m = at_m[0] - x_m, at_m[1] - y_m
+                at_m = np.array([c * ahead_m + s * left_m, c * left_m - s * ahead_m, at_m[2]])
+            places_m.append((camera, at_m))
+        for (one, one_m), (other, other_m) in combinations(places_m, 2):
+            farther_m = max(np.linalg.norm(one_m), np.linalg.norm(other_m))
+            if np.linalg.norm(one_m - other_m) <= _APART_M + _APART_SHARE * farther_m:
+                self._agreed[[one, other]] = True
+                self._votes[marker] = max(self._votes[marker] - 1, 0)
+            elif not (self._agreed[one] and self._agreed[other]):
+                self._votes[marker] = min(self._votes[marker] + 1, 2 * _LASTING)
+                self._last_ns[marker] = stamp_ns

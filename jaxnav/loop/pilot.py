@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
+from jaxnav.loop.actuation import Actuation
 from jaxnav.loop.camera_votes import CameraVotes
 from jaxnav.loop.chassis import chassis_of, pace_mps, root_of_sum
 from jaxnav.loop.corrections import Corrections
@@ -31,15 +32,18 @@ from jaxnav.loop.gyro_track import GyroTrack
 from jaxnav.loop.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
 from jaxnav.loop.history import EventData
 from jaxnav.loop.interfaces import GyroReading, Reading
+from jaxnav.loop.leaving import Corridor
 from jaxnav.loop.limits import Command
 from jaxnav.loop.odometer import Odometers
-from jaxnav.loop.outvoted import MarkerVotes
+from jaxnav.loop.outvoted import MarkerVotes, Twins
 from jaxnav.loop.stamps import Stamps
-from jaxnav.loop.standstill import Standstill, Way
+from jaxnav.loop.standstill import Standstill, Way, between
 from jaxnav.loop.support import Support
+from jaxnav.loop.turn_votes import TurnVotes
 from jaxnav.loop.ways import Fix
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.navigator import Navigator, Output
+from jaxnav.pose.candidates import Candidates
 
 SLEPT_NS = 1_000_000_000  # after a pause this long in the loop, its belief is out of date
 GYRO_STALE_S = 0.1  # as the odometer
@@ -158,6 +162,7 @@ class Pilot:
         corner_sigma_px: float | None = None,
         relocate: bool = True,
         drives: bool = True,
+        leave_m: float = math.inf,
     ):
         """Args:
         navigator: with a vehicle and waypoints.
@@ -167,6 +172,7 @@ class Pilot:
         relocate: whether to drive on from a pose that no slip explains, slowly at first; else stop.
         drives: whether the commands are the pilot's; else somebody else drives, they are zero, and
             no throttle is known to hold the odometer against.
+        leave_m: how far from its route it may drive, see `Corridor`.
         """
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
@@ -177,8 +183,12 @@ class Pilot:
         self._corrections = Corrections.of(navigator.controller.vehicle)
         gyro = gyro_of(navigator)
         self._gyro = None if gyro is None else GyroTrack(float(gyro.saturation_radps))
-        mean_radps = None if self._gyro is None else self._gyro.mean_radps
+        mean_radps = None if self._gyro is None else self._mean_radps
         self._estimator = Estimator(navigator, program, mean_radps)
+        self._turns: TurnVotes | None = None
+        if self._gyro is not None and gyro is not None:
+            bias_radps = float(gyro.bias_sigma_radps)
+            self._turns = TurnVotes(self._chassis, bias_radps, self._gyro.mean_radps)
         self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._drives = drives
@@ -187,8 +197,15 @@ class Pilot:
         self._standstill = Standstill(Way(self._chassis.lever_m), self._chassis.time_constant_s)
         self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
         self._support = Support(self._chassis, relocate)
+        self._actuation = Actuation(self._chassis)
+        self._corridor = Corridor(navigator.controller.waypoints_m, leave_m)
         self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
+        self._twins = Twins(navigator)
+        centres_m = np.asarray(navigator.markers.Ts_world_marker.translation(), float)
+        self._centres_m = centres_m.tolist()
+        self._lane, self._look_ns = (0, 0), 0  # camera and marker whose range is watched, and when
+        self._on_twins = False  # whether the estimate may be by an id at two places
         self._sure = False  # whether the estimate may judge cameras
         self._odometer_ns: int | None = None
         self._fix_ns: int | None = None
@@ -207,6 +224,7 @@ class Pilot:
         """Compile the programs without changing the pilot's state."""
         self._estimator.warm_up()
         due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
+        self._twins.warm_up()
 
     def handle(self, given: Input) -> Outcome:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
@@ -219,6 +237,10 @@ class Pilot:
         if data is not None:
             self._judge_cameras(data, stamp_ns)
             data = self._camera_votes.remove_outvoted(data)
+        if data is not None:
+            data = self._twins.remove_twins(data, stamp_ns, self._standstill.way)
+        if self._twins.seen(now_ns):
+            faults |= Fault.DUPLICATE_MARKER
         if data is not None:
             data = self._marker_votes.remove_outvoted(data)
         if data is not None:
@@ -238,6 +260,8 @@ class Pilot:
         if self._odometry_stamps.jumps > jumps:
             faults |= Fault.CLOCK_JUMPED
         driven_mps, motion = chassis.driven_mps(reading), chassis.motion(reading)
+        if self._turns is not None:
+            self._turns.add_reading(now_ns, motion)
         pace = pace_mps(driven_mps)
         believable, faults_seen = self._odometers.judge(
             driven_mps,
@@ -289,15 +313,28 @@ class Pilot:
             self._left = self._known
             self._restarts_ns.append(now_ns)
             self._support.note_restart()
+            if self._turns is not None:
+                self._turns.forget()
         if data is not None and data.corners_px is not None and not fused.refused:
             self._marker_votes.count(data, np.asarray(fused.output.outvoted))
-            rejects |= self._judge(known, fused.belief, stamp_ns, now_ns)
+            candidates = vars(fused.output)["candidates"]
+            self._add_place(data, stamp_ns, candidates)
+            rejects |= self._judge(known, fused.belief, candidates, stamp_ns, now_ns)
         doubts = self._support.faults
+        if self._drives:
+            doubts |= self._actuation.faults
         faults |= doubts
+        if self._turns is not None and self._turns.gyro_is_wrong:
+            faults |= Fault.GYRO_CONTRADICTED
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
         faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
         faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
-        self._sure = known.decided and self._support.confirmed and not doubts
+        sure = known.decided and self._support.confirmed and not doubts
+        # A fix since then is by other ids.
+        self._on_twins = self._twins.seen(now_ns) and (self._fix_ns or 0) < self._twins.last_ns
+        self._sure = sure and not self._on_twins
+        if self._drives and self._sure and self._corridor.is_left(known.pose[:2]):
+            faults |= Fault.LEFT_ROUTE
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
@@ -338,13 +375,21 @@ class Pilot:
         moves = known.velocity, known.velocity_covariance
         return self._chassis.believed_mps(float(known.pose[2]), *moves)
 
-    def _judge(self, known: _Known, belief: Belief, stamp_ns: int, now_ns: int) -> Reject:
+    def _judge(
+        self, known: _Known, belief: Belief, candidates: Candidates, stamp_ns: int, now_ns: int
+    ) -> Reject:
         """Use the corners to confirm or doubt the estimate; return their `Reject` flags."""
         agrees = known.accepted and known.nis <= known.gate_nis
         if not agrees:
             self._camera_votes.note_contradiction(stamp_ns)
         self._monitor.corners(agrees)
         fix = _fix(known.pose, known.pose_covariance) if known.decided else None
+        if fix is None or not agrees:
+            self._actuation.add_headings(now_ns, _headings(candidates))
+        elif self._support.confirmed:
+            self._actuation.add_fix(now_ns, fix)
+            if self._turns is not None:
+                self._turns.add_fix(now_ns, fix.psi_rad)
         bank = belief.bank
         alive = zip(*planar_poses(bank), bank.initialised, strict=True)
         support = self._support
@@ -365,6 +410,28 @@ class Pilot:
             return Reject.INNOVATION
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
 
+    def _add_place(self, data: EventData, stamp_ns: int, candidates: Candidates) -> None:
+        """Watch how the range of a marker in view changes; see `Ranges`."""
+        visible, valid = data.visible, np.asarray(candidates.valid)
+        assert visible is not None
+        then_ns, way = self._look_ns, self._standstill.way
+        if not valid.any() or stamp_ns <= then_ns:
+            return
+        if not visible[self._lane]:
+            camera, marker = np.argwhere(visible)[0].tolist()
+            self._lane = camera, marker
+        if visible.any(axis=1).sum() > 1:
+            # Of several cameras the pose is theirs together: their places tell its range.
+            place_m = self._twins.place_m(*self._lane)
+        else:
+            best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
+            T_vehicle_world = np.asarray(candidates.T_vehicle_world.wxyz_xyz)[best].tolist()
+            place_m = _transformed(T_vehicle_world, self._centres_m[self._lane[1]])
+        then, now = way.at(then_ns), way.at(stamp_ns)
+        motion = None if then is None or now is None else between(then, now)
+        if self._support.ranges.add_place(self._lane, place_m, motion):
+            self._look_ns = stamp_ns
+
     def _judge_cameras(self, data: EventData, stamp_ns: int) -> None:
         """Let a sure estimate vote on the cameras in view; see `CameraVotes`."""
         known = self._known
@@ -375,7 +442,9 @@ class Pilot:
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
-        doubt = self._support.doubt(self._monitor.contradicted)
+        disobeyed = self._drives and bool(self._actuation.faults)
+        contradicted = self._monitor.contradicted or disobeyed or self._on_twins
+        doubt = self._support.doubt(contradicted)
         if not (doubt.is_doubted and known.decided):
             return output, known
         covariances = [np.array(output.pose_covariance), np.array(output.covariance)]
@@ -389,6 +458,9 @@ class Pilot:
         return honest, known._replace(pose_covariance=covariances[0])
 
     def _limited(self, known: _Known, factor: float, now_ns: int, elapsed_ns: int) -> Command:
+        for judge in (self._actuation, self._turns):
+            if judge is not None:
+                judge.add_command(self._command, min(elapsed_ns, SLEPT_NS) / 1e9)
         if self._drives:
             wanted = self.limits.slowed(known.command, factor)
             self._command = self.limits.within(wanted, self._command, elapsed_ns / 1e9)
@@ -411,7 +483,7 @@ class Pilot:
             faults=faults,
             restarts=len(self._restarts_ns),
             confirmed=self._support.confirmed,
-            refused=self._support.refused,
+            refused=self._support.stands or (self._drives and self._actuation.gives_up),
         )
 
     def _age_s(self, stamp_ns: int | None, now_ns: int) -> float:
@@ -437,12 +509,21 @@ class Pilot:
     def _begin_anew(self, reason: str) -> None:
         self._estimator.reset()
         self._support.begin_anew()
+        self._actuation.forget()
+        if self._turns is not None:
+            self._turns.forget()
         self._restarts += 1
         if self._now_ns is not None:
             self._restarts_ns.append(self._now_ns)
         self._restarts_before, self._restart_reason = self._restarts, reason
         self._fix_ns, self._distance_m = None, 0.0
         self._left = self._known
+
+    def _mean_radps(self, begin_ns: int, end_ns: int) -> float:
+        """What the gyro tells of the interval between two times; NaN: nothing, or it is wrong."""
+        assert self._gyro is not None
+        assert self._turns is not None
+        return math.nan if self._turns.gyro_is_wrong else self._gyro.mean_radps(begin_ns, end_ns)
 
     def _seeing(self, now_ns: int) -> bool:
         """Whether recent corners tell how fast the vehicle is."""
@@ -454,6 +535,30 @@ def _fix(pose: np.ndarray, covariance: np.ndarray) -> Fix:
     x_m, y_m, psi_rad = map(float, pose[:3])
     sigma_rad = math.sqrt(max(float(covariance[2, 2]), 0.0))
     return Fix(x_m, y_m, psi_rad, root_of_sum(covariance), sigma_rad)
+
+
+def _headings(candidates: Candidates) -> list[tuple[float, float]]:
+    """Where the vehicle heads by each pose that the corners may mean: psi_rad, sigma_rad."""
+    of = vars(candidates)
+    quaternions, covariances = of["T_vehicle_world"].wxyz_xyz[:, :4], of["covariance"]
+    headings = []
+    for index in np.flatnonzero(of["valid"]).tolist():
+        w, x, y, z = quaternions[index].tolist()
+        psi_rad = math.atan2(2 * (x * y - w * z), 1 - 2 * (y * y + z * z))
+        headings.append((psi_rad, math.sqrt(max(float(covariances[index, 5, 5]), 0.0))))
+    return headings
+
+
+def _transformed(wxyz_xyz: list[float], point: list[float]) -> list[float]:
+    """A point moved by a pose; NumPy's own product takes three times as long."""
+    w, a, b, c, *shift = wxyz_xyz
+    x, y, z = point
+    u, v, t = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    return [
+        x + w * u + b * t - c * v + shift[0],
+        y + w * v + c * u - a * t + shift[1],
+        z + w * t + a * v - b * u + shift[2],
+    ]
 
 
 def _apart(pose: np.ndarray, other: np.ndarray) -> str:

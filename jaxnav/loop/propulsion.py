@@ -18,6 +18,28 @@ _UNTRUE = 10  # excess of contradicting readings with markers in view: then the 
 
 
 @dataclass
+class Reach:
+    """The range in which a driven part is, as it follows its commands.
+
+    Attributes:
+        factor: of its gain; that of its time constant is two.
+    """
+
+    time_constant_s: float
+    factor: float = _FACTOR
+    least: float = 0.0
+    most: float = 0.0
+
+    def go(self, target: float, gap_s: float) -> None:
+        """Take what a command drives it towards, and for how long."""
+        slow = 1 - math.exp(-gap_s / (_FACTOR * self.time_constant_s))
+        least, most = sorted((target / self.factor, target * self.factor))
+        # Brakes and a better motor act at once.
+        self.least = min(least, self.least + slow * (least - self.least))
+        self.most = max(most, self.most + slow * (most - self.most))
+
+
+@dataclass
 class Propulsion:
     """The speed range of a driven part expected from its command, and the deviation from it.
 
@@ -29,9 +51,10 @@ class Propulsion:
     time_constant_s: float
     off_m: float = 0.0
     _nominal_mps: float = 0.0
-    _least_mps: float = 0.0
-    _most_mps: float = 0.0
     _untrue: int = 0
+
+    def __post_init__(self) -> None:
+        self._reach_mps = Reach(self.time_constant_s)
 
     @property
     def doubtful(self) -> bool:
@@ -50,17 +73,11 @@ class Propulsion:
             disputed: the corners' way differs from the odometer's. Where the two agree, the
                 throttle is wrong: the car is carried, towed, replayed, or not as in its file.
         """
-        target = wanted_mps
-        slow = 1 - math.exp(-gap_s / (_FACTOR * self.time_constant_s))
-        least, most = sorted((target / _FACTOR, target * _FACTOR))
-        # Brakes and a better motor act at once.
-        self._least_mps = min(least, self._least_mps + slow * (least - self._least_mps))
-        self._most_mps = max(most, self._most_mps + slow * (most - self._most_mps))
+        self._reach_mps.go(wanted_mps, gap_s)
         lagged = 1 - math.exp(-gap_s / self.time_constant_s)
-        self._nominal_mps += lagged * (target - self._nominal_mps)
-        contradicts = not (
-            self._least_mps - _MARGIN_MPS <= speed_mps <= self._most_mps + _MARGIN_MPS
-        )
+        self._nominal_mps += lagged * (wanted_mps - self._nominal_mps)
+        least_mps, most_mps = self._reach_mps.least, self._reach_mps.most
+        contradicts = not least_mps - _MARGIN_MPS <= speed_mps <= most_mps + _MARGIN_MPS
         if disputed:
             self._untrue = 0
         elif seeing:

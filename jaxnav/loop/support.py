@@ -2,6 +2,7 @@
 
     # With each reading:
     support.add_odometry(driven_mps, motion, heading_rad, gap_s, wanted_mps, seeing)
+    support.ranges.add_place(lane, place_m, motion)  # with every frame that shows markers
     is_fix = support.add_corners(accepted, agrees, now_ns, fix, possible)  # with every frame
     support.doubt(contradicted)
 
@@ -17,7 +18,7 @@ from typing import NamedTuple
 from jaxnav.loop.chassis import Chassis, Motion, pace_mps
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.propulsion import Propulsion
-from jaxnav.loop.ways import Fix, Ways
+from jaxnav.loop.ways import Fix, Ranges, Ways
 
 CONFIRMED = 2  # frames in a row, with the first: a single one never confirms
 # Way driven slowly after a relocation, so that a person can look at the car: about five seconds at
@@ -41,6 +42,7 @@ class Support:
     Attributes:
         refused: the pose is out of reach, which is not allowed (`relocate` is False).
         relocations: number of relocations so far.
+        ranges: see `Ranges`.
     """
 
     def __init__(self, chassis: Chassis, relocate: bool = True):
@@ -50,7 +52,7 @@ class Support:
         self.refused = False
         self.relocations = 0
         self._relocate = relocate
-        self._ways = Ways(chassis.slides_m)
+        self._ways, self.ranges = Ways(chassis.slides_m), Ranges()
         self._propulsions = [Propulsion(chassis.time_constant_s) for _ in chassis.tops_mps]
         self._confirmations, self._needed = 0, CONFIRMED
         self._restarted = False
@@ -72,9 +74,16 @@ class Support:
         faults = Fault.RELOCATED if self.relocated else _NO_FAULT
         if self._ways.disputed:
             faults |= Fault.WAYS_DISPUTED
+        if self.ranges.contradicted:
+            faults |= Fault.FILES_CONTRADICTED
         if self._doubtful:
             faults |= Fault.ODOMETRY_DOUBTFUL
         return faults
+
+    @property
+    def stands(self) -> bool:
+        """Whether to drive no farther: refused, or the files contradict the drive for long."""
+        return self.refused or self.ranges.lasting
 
     def add_odometry(
         self,
@@ -161,6 +170,7 @@ class Support:
         off_m = self._off_m if doubtful else 0.0
         if contradicted or self.refused:
             off_m += self._ways.since_fix_m
+        contradicted |= self.ranges.contradicted
         is_doubted = not self.confirmed or self.refused or contradicted or doubtful
         return Doubt(is_doubted, off_m)
 

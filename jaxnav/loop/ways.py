@@ -15,10 +15,18 @@ measures, since a slow drag is hidden by wheel slip and a leap is not:
 
 Neither detects a copy carried slower than DRIFT_SHARE of the car's own speed or by less than the
 two margins, or one that was there from the beginning.
+
+    ranges.add_place(lane, place_m, motion)               # with every frame that shows markers
+    ranges.contradicted, ranges.lasting
+
+How fast a marker comes nearer needs no estimate: neither of a pose, nor of which of two it is. A
+marker or a focal length that is s times as large as its file says makes every range s times as
+long, wheels make every way so, and a camera that looks the other way sees a marker go that comes.
 """
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -39,6 +47,20 @@ _AGREES_M = 0.02
 _GAP_NS = 500_000_000  # after longer gaps without corners dead reckoning has errors of its own
 _SILENT_S = 0.1  # a longer gap between readings leaves the way unknown
 _SIGMAS = 3.0
+
+# Ranges change by this share more or less than the way: the prior of the wheels' scale, 3 %, and a
+# slip of 5 % that forgets itself on 0.2 m, over half a metre (`SENSORS_AS_TOLD`, `slip_sigma`).
+_WHEELS = 0.05
+# A range may be off by this share of it at one place, and not at the next: what lenses leave at
+# different places in the image, as `_JITTER_M` where cameras are late while the vehicle speeds up.
+_LENS, _JITTER_M = 0.01, 0.01
+_STRIDE_M = 0.01  # between two looks that count: a standing vehicle tells nothing new
+_FORGETS_M = 0.5  # way on which the weight of a look falls to 1/e
+_LEAST_LOOKS, _IN_A_ROW = 5, 3
+_LEAP_SHARE = 0.1  # of the range, beyond the way: the vehicle or the marker was carried off
+# A lane whose ranges have agreed this well is as its files say: what differs later is slip.
+_TRUE = 0.15
+_LASTING_M = 0.5  # way after a contradiction on which it must pass
 
 
 class Fix(NamedTuple):
@@ -163,6 +185,89 @@ class Ways:
         self.disputed = False
         self._window.clear()
         self._window.append(here)
+
+
+@dataclass
+class Ranges:
+    """How the range of a marker changes by corners and by the odometer, in one drive.
+
+    Over the last way, with weights that fade, ranges r by corners are fitted to those x that the
+    odometer alone gives: r = a + slope x. The slope is 1 where all files are true.
+
+    Attributes:
+        contradicted: the slope is not, and never was with this camera and marker.
+        lasting: it has been so for a while of way.
+    """
+
+    contradicted: bool = False
+    slope: float = 1.0
+    sigma: float = math.inf
+    _lane: tuple[int, int] | None = None
+    _true: set[tuple[int, int]] = field(default_factory=set)
+    _place_m: Sequence[float] = (0.0, 0.0, 0.0)  # at the last look that counts
+    _range_m: float = 0.0
+    _x_m: float = 0.0
+    _since_m: float = 0.0  # way since the contradiction
+    _sums: list[float] = field(default_factory=lambda: [0.0] * 6)  # of 1, x, r, xx, xr, rr
+    _odd: int = 0  # looks in a row that contradict
+
+    @property
+    def lasting(self) -> bool:
+        """See the class."""
+        return self.contradicted and self._since_m > _LASTING_M
+
+    def add_place(
+        self,
+        lane: tuple[int, int],
+        place_m: Sequence[float],
+        motion: tuple[float, float, float] | None,
+    ) -> bool:
+        """Take where corners alone have a marker; return whether the look counts.
+
+        Args:
+            lane: camera and marker.
+            place_m: of the marker's centre, in the vehicle's axes.
+            motion: by the odometer since the last look that counts, (x_m, y_m, psi_rad) in the
+                vehicle's axes then; None: not known.
+        """
+        range_m, way_m = math.hypot(*place_m), 0.0
+        if lane == self._lane and motion is not None:
+            x_m, y_m, z_m = self._place_m
+            way_m = math.hypot(motion[0], motion[1])
+            nearer_m = self._range_m - math.hypot(x_m - motion[0], y_m - motion[1], z_m)
+            leaps_m = abs(self._range_m - nearer_m - range_m)
+        if lane != self._lane or motion is None or leaps_m > _LEAP_SHARE * range_m:
+            self._lane, self._x_m = lane, range_m
+            self._sums, self._odd = [0.0] * 6, 0
+        elif way_m < _STRIDE_M:
+            return False
+        else:
+            self._x_m -= nearer_m
+            self._since_m += way_m
+        self._place_m, self._range_m = place_m, range_m
+        self._look(range_m, math.exp(-way_m / _FORGETS_M))
+        return True
+
+    def _look(self, range_m: float, kept: float) -> None:
+        x_m, lane = self._x_m, self._lane
+        new = (1.0, x_m, range_m, x_m * x_m, x_m * range_m, range_m * range_m)
+        self._sums = [kept * old + one for old, one in zip(self._sums, new, strict=True)]
+        count, x, r, xx, xr, rr = self._sums
+        xx, xr, rr = xx - x * x / count, xr - x * r / count, rr - r * r / count
+        if count < _LEAST_LOOKS or xx <= 0 or lane is None:
+            return
+        self.slope = slope = xr / xx
+        noise = max(rr - slope * xr, 0.0) / (count - 2)
+        # An error that grows along the whole way, whose looks lie evenly on it.
+        along = (_LENS * range_m) ** 2 + _JITTER_M**2
+        self.sigma = sigma = math.sqrt(noise / xx + along * count / (12 * xx) + _WHEELS**2)
+        off = abs(slope - 1)
+        self._odd = self._odd + 1 if off > _SIGMAS * sigma else 0
+        if off + sigma < _TRUE:
+            self._true.add(lane)
+            self.contradicted = False
+        elif self._odd >= _IN_A_ROW and lane not in self._true and not self.contradicted:
+            self.contradicted, self._since_m = True, 0.0
 
 
 def _part_m(one: _Anchor, other: _Anchor) -> float:

@@ -72,6 +72,7 @@ class RouteEntry(Entry):
     waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
     waypoint_radius_m: Radius
     start_pose: Annotated[list[Position], Field(min_length=3, max_length=3)]
+    leave_m: Radius | None = None
 
     @field_validator("start_pose")
     @classmethod
@@ -84,7 +85,7 @@ class RouteEntry(Entry):
         """The `Route` of this entry."""
         x_m, y_m, psi_rad = self.start_pose
         waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
-        return Route(waypoints_m, self.waypoint_radius_m, (x_m, y_m, psi_rad))
+        return Route(waypoints_m, self.waypoint_radius_m, (x_m, y_m, psi_rad), self.leave_m)
 
 
 _timeouts: dict[str, Any] = {limit.name: (_Limit, ...) for limit in fields(Timeouts)}
@@ -204,7 +205,13 @@ class DriveSetup:
         navigator = self.navigator()
         program = compile_or_load(advance_packed, navigator, folder)
         return Pilot(
-            navigator, self.timeouts, program, self.corner_sigma_px, self.relocate, self.drives
+            navigator,
+            self.timeouts,
+            program,
+            self.corner_sigma_px,
+            self.relocate,
+            self.drives,
+            self.route.leaves_at_m,
         )
 
     def header(self) -> dict[str, Any]:
@@ -214,7 +221,7 @@ class DriveSetup:
             "rig": rig_data(self.rig),
             "markers": marker_data(self.markers),
             "vehicle": vehicle_data(self.vehicle),
-            "route": asdict(self.route),
+            "route": {name: n for name, n in asdict(self.route).items() if n is not None},
             "selector": self.selector,
             "corner_sigma_px": self.corner_sigma_px,
             "timeouts": asdict(self.timeouts),

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.detection.observe import are_mirrored
 from jaxnav.detection.types import Detections
 from jaxnav.loop.interfaces import Camera, Frame, Odometry, OpenCameras, Setup, Vehicle
 from jaxnav.loop.plugins import missing_members
@@ -133,6 +134,9 @@ def _check_frame(frame: object, name: str, size_px: tuple[int, int]) -> None:
         assert isinstance(frame.detections, Detections), f"the detections of {what} are none"
         shape, count = frame.detections.corners_px.shape, len(frame.detections)
         assert shape == (count, 4, 2), f"the corners of {what} have the shape {shape}"
+        assert not are_mirrored(frame.detections.corners_px, frame.detections.sigma_px).any(), (
+            f"the corners of {what} run anticlockwise, not from top left to top right and on"
+        )
     if frame.image is not None:
         image, (width_px, height_px) = np.asarray(frame.image), size_px
         assert image.dtype == np.uint8, f"the image of {what} is {image.dtype}, expected uint8"

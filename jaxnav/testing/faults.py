@@ -3,7 +3,8 @@
     for row in matrix():
         print(line(run_trial(row, trial)))
 
-All faults act on corners, in lockstep drives of the simulated car through a loop of waypoints.
+All faults act on corners, in lockstep drives of the simulated car, or of another base, through a
+loop of waypoints.
 Faults of images are tested with the search of frames, threads and signals with the loop.
 """
 
@@ -11,23 +12,23 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
-import equinox as eqx
-import jax.numpy as jnp
-import jaxlie
 import numpy as np
 
 from jaxnav.compiling.step import strip_static
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.vehicles import Route
 from jaxnav.loop.camera_delays import CameraDelays
+from jaxnav.loop.chassis import chassis_of
 from jaxnav.loop.estimator import Program
 from jaxnav.loop.flags import Fault, Health, Reject, names
-from jaxnav.loop.pilot import Pilot
+from jaxnav.loop.pilot import Outcome, Pilot
 from jaxnav.models.bicycle import Vehicle
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.origin import ZERO, Origin, planar_in_world, points_in_world
 from jaxnav.models.rig import CameraRig
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.testing.injections import between
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates, Step, drive
@@ -36,6 +37,8 @@ from jaxnav.vehicles.world import SimWorld
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
 ALL_CAMERAS = range(4)  # of the trial's rig
 SETTLE_S = 2.0  # this long after a fault the position must be right again
+# Whoever is farther off than this, and drives on at health OK, lies: a stranger's hand or shin.
+LIE_M = 0.5
 WAYPOINTS_M = (
     (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
     (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
@@ -60,11 +63,14 @@ class FaultRow:
         begins_s, ends_s: of the fault; inf: it lasts.
         always: the data are changed before `begins_s` too.
         drive_s: duration of the whole drive.
-        telling: how the navigator's rig differs from the true one, see `navigator_rig`.
+        telling: makes the rig of the navigator's file from the true one.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
         shift_m: offset of the files' coordinates of map and route from the trial's world.
+        bases: the vehicles on which it is tried, see `Trial.base`.
+        gyro: tried only on vehicles that have one.
+        lied_m, named_m, slow_m, stood_m: the most that the `Ways` of the drive may be.
     """
 
     name: str
@@ -80,11 +86,38 @@ class FaultRow:
     always: bool = False
     drive_s: float = 7.0
     rates: Rates = field(default_factory=Rates)
-    telling: str = ""
+    telling: Callable[[CameraRig], CameraRig] = lambda rig: rig
     markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     relocate: bool = True
     well: Health = Health.OK
     shift_m: Origin = ZERO
+    bases: tuple[str, ...] = ("ackermann",)
+    gyro: bool = False
+    lied_m: float = math.inf
+    named_m: float = math.inf
+    slow_m: float = math.inf
+    stood_m: float = math.inf
+
+    def suits(self, trial: "Trial") -> bool:
+        """Whether the row is tried on the trial's vehicle."""
+        has_gyro = trial.vehicle.gyro is not None
+        return trial.base in self.bases and (has_gyro or not self.gyro)
+
+
+@dataclass(frozen=True)
+class Ways:
+    """How far the vehicle has truly driven, m, with the way of its rim where it turns.
+
+    Attributes:
+        lied_m: at health OK while its pose is more than LIE_M off.
+        named_m, slow_m, stood_m: from the fault's begin until one of the row's faults is told,
+            until health is DEGRADED or worse, and until it stands in the end; inf: never.
+    """
+
+    lied_m: float
+    named_m: float
+    slow_m: float
+    stood_m: float
 
 
 @dataclass(frozen=True)
@@ -99,19 +132,27 @@ class Result:
     error_after_m: float
     recovered_s: float  # from the fault's end to lasting health; inf: never, or the fault lasts
     restarts: int
+    ways: Ways
     broken: tuple[str, ...]  # promises that were not kept
 
 
 @dataclass(frozen=True)
 class Trial:
-    """The car and world in which the faults are tried."""
+    """The vehicle and world in which the faults are tried."""
 
     rig: CameraRig
     markers: MarkerMap
-    vehicle: Vehicle
+    vehicle: Vehicle | TwistBase
     start_pose: tuple[float, float, float] = (2.0, -1.0, math.radians(125.0))
     seed: int = 0
     program: Callable[[Navigator], Program] | None = None  # see `Pilot`; by default by `jax.jit`
+
+    @property
+    def base(self) -> str:
+        """The kind of the vehicle, one of `BASES` of the simulation."""
+        if not isinstance(self.vehicle, TwistBase):
+            return "ackermann"
+        return "omni" if self.vehicle.left_limit_mps > 0 else "differential"
 
 
 def run_trial(row: FaultRow, trial: Trial) -> Result:
@@ -119,17 +160,18 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
     markers, route = shift_origin(trial, row.shift_m)
     navigator = Navigator(
-        rig=navigator_rig(trial.rig, row.telling),
+        rig=row.telling(trial.rig),
         markers=markers,
         vehicle=trial.vehicle,
         waypoints_m=route.waypoints_m,
         waypoint_radius_m=route.waypoint_radius_m,
     )
     program = trial.program and trial.program(strip_static(navigator))
-    pilot = Pilot(navigator, program=program, relocate=row.relocate)
+    leave_m = route.leaves_at_m
+    pilot = Pilot(navigator, program=program, relocate=row.relocate, leave_m=leave_m)
     world = SimWorld(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
     delays = None
-    if Fault.CAMERA_LATE in row.faults:
+    if Fault.CAMERA_LATE in row.faults and isinstance(trial.vehicle, Vehicle):
         delays = CameraDelays(navigator.rig, markers, trial.vehicle)
     change = between(-math.inf if row.always else row.begins_s, row.ends_s, row.change())
     steps = list(drive(pilot, world, row.drive_s, change, row.rates, row.happens(), delays))
@@ -149,23 +191,6 @@ def shift_origin(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     waypoints_m = points_in_world(WAYPOINTS_M, (x_m, y_m, z_m))
     start_pose = planar_in_world(trial.start_pose, (x_m, y_m, z_m))
     return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
-
-
-def navigator_rig(rig: CameraRig, telling: str) -> CameraRig:
-    """The rig that the navigator gets: the true calibration, or a wrong one."""
-    Ts = rig.Ts_camera_vehicle
-    if telling == "focal":
-        return eqx.tree_at(lambda r: r.cameras.focal_px, rig, 1.02 * rig.cameras.focal_px)
-    if telling == "swapped":
-        order = np.array([0, *range(len(rig) - 1, 0, -1)])
-        return eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, rig, Ts.wxyz_xyz[order])
-    if telling == "extrinsics":
-        directions = np.random.default_rng(0).standard_normal((len(rig), 2, 3))
-        directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-        xi = np.concatenate([0.01 * directions[:, 0], np.deg2rad(1.0) * directions[:, 1]], axis=1)
-        moved = Ts @ jaxlie.SE3.exp(jnp.asarray(xi, Ts.wxyz_xyz.dtype))
-        return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, moved)
-    return rig
 
 
 def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
@@ -192,15 +217,49 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
         float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
         recovered_s,
         outcomes[-1].restarts,
+        ways_of(row, steps, chassis_of(pilot.navigator.controller.vehicle).lever_m),
         (),
     )
     return dataclasses.replace(result, broken=tuple(_broken(result, steps, pilot)))
 
 
+def ways_of(row: FaultRow, steps: list[Step], lever_m: float) -> Ways:
+    """Measure how far a drive went on a lie.
+
+    Args:
+        lever_m: way of the rim by a turn of 1 rad, see `Chassis`.
+    """
+    lied_m = way_m = 0.0
+    reached: dict[str, float] = {}
+    for before, step in pairwise(steps):
+        moved = step.truth[:3] - before.truth[:3]
+        gone_m = float(np.hypot(*moved[:2])) + lever_m * abs(float(moved[2]))
+        outcome = before.outcome
+        off_m = np.hypot(*(outcome.pose - planar_in_world(before.truth[:3], outcome.origin_m))[:2])
+        if outcome.health == Health.OK and off_m > LIE_M:
+            lied_m += gone_m
+        if (step.input.now_ns - BEGIN_NS) / 1e9 < row.begins_s:
+            continue
+        way_m += gone_m
+        if step.outcome.faults & row.faults:
+            reached.setdefault("named_m", way_m)
+        if step.outcome.health >= Health.DEGRADED:
+            reached.setdefault("slow_m", way_m)
+    if _stands(steps[-1].outcome):
+        reached["stood_m"] = way_m
+    told = (reached.get(name, math.inf) for name in ("named_m", "slow_m", "stood_m"))
+    return Ways(lied_m, *told)
+
+
+def _stands(outcome: Outcome) -> bool:
+    """Whether it is told to stand."""
+    return outcome.throttle == 0 and not any(outcome.twist or ())
+
+
 def _error_m(step: Step) -> float:
     """The error, m, of a decided position while the car drives; NaN otherwise."""
     outcome = step.outcome
-    if not outcome.output.decided or outcome.throttle == 0:
+    if not outcome.output.decided or _stands(outcome):
         return math.nan
     truth = planar_in_world(step.truth[:3], outcome.origin_m)
     return float(np.hypot(*(outcome.pose[:2] - truth[:2])))
@@ -220,6 +279,9 @@ def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
         said.append(f"error afterwards {result.error_after_m:.3f} m")
     if math.isfinite(row.ends_s) and result.recovered_s > SETTLE_S:
         said.append(f"recovered after {result.recovered_s:.1f} s")
+    for name, way_m in dataclasses.asdict(result.ways).items():
+        if way_m > getattr(row, name):
+            said.append(f"{name} {way_m:.2f}")
     limits = pilot.limits
     for step in steps:
         command = step.outcome.command
@@ -234,8 +296,9 @@ def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
 
 
 HEADER = (
-    "| fault | seen | worst health | error m | afterwards | recovered s | restarts | kept |\n"
-    "|---|---|---|---|---|---|---|---|"
+    "| fault | seen | worst health | error m | afterwards | recovered s | restarts | "
+    "m at OK and off | m until named | slow | standing | kept |\n"
+    f"|{12 * '---|'}"
 )
 
 
@@ -244,7 +307,12 @@ def line(result: Result) -> str:
     seen = ", ".join([*names(result.faults), *names(result.rejects)]).lower() or "-"
     recovered = "-" if math.isinf(result.recovered_s) else f"{result.recovered_s:.2f}"
     kept = "; ".join(result.broken) or "yes"
+    ways = [
+        "-" if math.isinf(way_m) else f"{way_m:.2f}"
+        for way_m in dataclasses.asdict(result.ways).values()
+    ]
     return (
         f"| {result.row.name} | {seen} | {result.worst.name} | {result.error_m:.3f} | "
-        f"{result.error_after_m:.3f} | {recovered} | {result.restarts} | {kept} |"
+        f"{result.error_after_m:.3f} | {recovered} | {result.restarts} | {' | '.join(ways)} | "
+        f"{kept} |"
     )

@@ -12,12 +12,12 @@ from jaxtyping import Float
 from jaxnav.detection.types import Detections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
+from jaxnav.loop.interfaces import GyroReading, Odometry, Reading, reading_of
 from jaxnav.loop.pilot import Input
 from jaxnav.testing.lockstep import BEGIN_NS, Change
 
 EditFrame = Callable[[FrameDetections], FrameDetections | None]  # None: the frame is lost
-EditOdometry = Callable[[Odometry], Odometry | None]
+EditOdometry = Callable[[Any], Reading | None]  # of one kind of vehicle
 
 
 def seconds(given: Input) -> float:
@@ -43,10 +43,10 @@ def frames(edit: EditFrame) -> Change:
 
 
 def odometry(edit: EditOdometry) -> Change:
-    """Edit all readings of a car's odometer."""
+    """Edit all readings of the odometer."""
 
     def change(given: Input) -> list[Input]:
-        if not isinstance(given.odometry, Odometry):
+        if given.odometry is None:
             return [given]
         edited = edit(given.odometry)
         return [] if edited is None else [dataclasses.replace(given, odometry=edited)]
@@ -140,8 +140,24 @@ def frozen(cameras: Iterable[int], jitter_px: float, seed: int = 0) -> EditFrame
 
 
 def speed(edit: Callable[[float], float]) -> EditOdometry:
-    """Edit the measured speed, not the steering."""
-    return lambda reading: dataclasses.replace(reading, speed_mps=edit(reading.speed_mps))
+    """Edit the measured speed, not the steering; all parts of a twist."""
+
+    def edited(reading: Reading) -> Reading:
+        if isinstance(reading, Odometry):
+            return dataclasses.replace(reading, speed_mps=edit(reading.speed_mps))
+        return reading_of(reading.stamp_ns, tuple(map(edit, reading.values)), reading.valid)
+
+    return edited
+
+
+def gyro(edit: Callable[[float], float]) -> Change:
+    """Edit the rates that a gyro reads, rad/s."""
+
+    def change(given: Input) -> list[Input]:
+        told = (GyroReading(one.stamp_ns, edit(one.turn_radps)) for one in given.gyro)
+        return [dataclasses.replace(given, gyro=tuple(told))]
+
+    return change
 
 
 def constant() -> Callable[[Any], Any]:

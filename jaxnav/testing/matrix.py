@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -15,6 +16,8 @@ from jaxnav.loop.flags import Fault, Health, Reject
 from jaxnav.loop.interfaces import Odometry
 from jaxnav.loop.pilot import Input
 from jaxnav.models.markers import MarkerMap
+from jaxnav.models.rig import CameraRig
+from jaxnav.simulation.bases import BASES
 from jaxnav.testing import injections as inject
 from jaxnav.testing.faults import ALL_CAMERAS, BEGIN_S, FaultRow, Happens
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates
@@ -38,16 +41,19 @@ _stops = partial(FaultRow, health=(Health.STOP, Health.STOP))
 def matrix() -> list[FaultRow]:
     """All rows of the matrix."""
     return [
-        FaultRow("none"),
+        FaultRow("none", bases=BASES),
         *_cameras(),
         *_frames(),
         *_stamps(),
         *_odometry(),
         *_calibration_and_world(),
+        *_contradicted_files(),
         *_standstill(),
         *_nonsense(),
         *_spoofed(),
         *_maps(),
+        *_actuators(),
+        *_gyros(),
         # Frames taken earlier than their stamps, which no clock shows: this must be reported, but
         # the estimate's error meanwhile is not limited.
         _may_slow(
@@ -220,6 +226,91 @@ def _at(times_ns: range, act: Callable[[SimWorld], None]) -> Callable[[], Happen
 _once = partial(_at, range(_BEGIN_NS, _BEGIN_NS + 1))
 
 
+def _focal(by: float) -> Callable[[CameraRig], CameraRig]:
+    """A file whose focal lengths are so many times the true ones."""
+    return lambda rig: eqx.tree_at(lambda r: r.cameras.focal_px, rig, by * rig.cameras.focal_px)
+
+
+def _swapped(*order: int) -> Callable[[CameraRig], CameraRig]:
+    """A file that gives each camera the place of another one."""
+
+    def told(rig: CameraRig) -> CameraRig:
+        swapped = rig.Ts_camera_vehicle.wxyz_xyz[np.array(order)]
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle.wxyz_xyz, rig, swapped)
+
+    return told
+
+
+def _moved(xi: Callable[[int], np.ndarray]) -> Callable[[CameraRig], CameraRig]:
+    """A file that moves every camera of C by xi, (C, 6) or (6,), in the vehicle's axes."""
+
+    def told(rig: CameraRig) -> CameraRig:
+        Ts = rig.Ts_camera_vehicle
+        by = np.broadcast_to(xi(len(rig)), (len(rig), 6))
+        moved = Ts @ jaxlie.SE3.exp(jnp.asarray(by, Ts.wxyz_xyz.dtype))
+        return eqx.tree_at(lambda r: r.Ts_camera_vehicle, rig, moved)
+
+    return told
+
+
+def _off_by_hand(cameras: int) -> np.ndarray:
+    """1 cm and 1 deg, in any direction."""
+    directions = np.random.default_rng(0).standard_normal((cameras, 2, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    return np.concatenate([0.01 * directions[:, 0], np.deg2rad(1.0) * directions[:, 1]], axis=1)
+
+
+_misplaced = _moved(_off_by_hand)
+
+
+_FROM_THE_START = range(BEGIN_NS, BEGIN_NS + 1)
+
+
+def _contradicted_files() -> list[FaultRow]:
+    """Rows in which a file, or a copy, contradicts what the vehicle sees from the start."""
+
+    def larger(by: float) -> Callable[[], Happens]:
+        none_m = (0.0, 0.0, 0.0)
+        return _at(_FROM_THE_START, lambda world: world.move_markers(none_m, scale=1 / by))
+
+    lasting = partial(FaultRow, begins_s=0.0, ends_s=_LATEST, bases=BASES[:2])
+    never = partial(lasting, health=(Health.INIT,) * 2, lied_m=0.0, named_m=0.01, drive_s=2.0)
+    told = partial(
+        lasting,
+        faults=Fault.FILES_CONTRADICTED,
+        health=(_SLOW, Health.STOP),
+        error_m=np.inf,
+        lied_m=0.5,
+        drive_s=6.0,
+    )
+    turned = partial(told, named_m=0.3, stood_m=1.2)
+    return [
+        never(
+            "corners listed the other way round",
+            _cornered(lambda c: c[:, ::-1]),
+            Fault.CORNERS_MIRRORED,
+        ),
+        never(
+            "a copy that another camera sees",
+            happens=_at(_FROM_THE_START, lambda world: world.copy_markers((2.0, -1.6, np.pi))),
+            faults=Fault.DUPLICATE_MARKER,
+        ),
+        *(
+            told(f"marker size x{by:g}", happens=larger(by), named_m=at_m, stood_m=at_m + 0.7)
+            for by, at_m in ((2.0, 0.5), (0.5, 0.5), (1.2, 1.5), (0.8, 1.5))
+        ),
+        *(
+            told(f"focal length x{by:g}", telling=_focal(by), named_m=0.5, stood_m=1.2)
+            for by in (1.5, 0.7)
+        ),
+        turned("front and rear camera swapped", telling=_swapped(2, 1, 0, 3)),
+        turned(
+            "rig turned by 180 deg",
+            telling=_moved(lambda _: np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.pi])),
+        ),
+    ]
+
+
 def _calibration_and_world() -> list[FaultRow]:
     wrong = partial(_may_slow, begins_s=2.0, ends_s=_LATEST, drive_s=6.0)
 
@@ -245,11 +336,11 @@ def _calibration_and_world() -> list[FaultRow]:
         )
 
     return [
-        wrong("cameras off by 1 deg, 1 cm", telling="extrinsics"),
-        wrong("focal length off by 2 %", telling="focal"),
+        wrong("cameras off by 1 deg, 1 cm", telling=_misplaced),
+        wrong("focal length off by 2 %", telling=_focal(1.02)),
         _may_stop(
             "cameras swapped",
-            telling="swapped",
+            telling=_swapped(0, 3, 2, 1),
             # One that shares its view with another is outvoted; one that is alone looks right.
             faults=Fault.CAMERA_OUTVOTED | Fault.RESTARTED,
             error_m=np.inf,
@@ -449,4 +540,106 @@ def _maps() -> list[FaultRow]:
         # Maps so far away that float32 resolves only 0.5 m or 1 m there; nothing else is wrong.
         FaultRow("map 10 000 km from the origin", shift_m=(1e7, -1e7, 0.0)),
         FaultRow("map at UTM coordinates", shift_m=(448_251.37, 5_411_932.81, 0.0)),
+    ]
+
+
+_Numbers = tuple[float, ...]
+
+
+def _signed(*signs: float) -> Callable[[_Numbers], _Numbers]:
+    """Multiply each number of a command or of a reading."""
+    return lambda numbers: tuple(sign * n for sign, n in zip(signs, numbers, strict=True))
+
+
+def _actuators() -> list[FaultRow]:
+    """Rows in which a command moves the vehicle otherwise than it says.
+
+    Each with an odometer that tells the truth, and with one that tells what was commanded: it is
+    wired in the same way, or there is none on that part.
+    """
+    driven = partial(
+        FaultRow, error_m=np.inf, error_after_m=np.inf, health=(Health.STOP, Health.STOP),
+        ends_s=_LATEST, lied_m=0.5, named_m=0.5, slow_m=0.5, stood_m=1.0, drive_s=8.0,
+    )  # fmt: skip
+
+    def wired(
+        name: str,
+        faults: Fault,
+        acts: Callable[[_Numbers], _Numbers],
+        tells: Callable[..., _Numbers],
+        bases: tuple[str, ...],
+    ) -> list[FaultRow]:
+        told = {"true": {}, "told": {"reads": tells}}
+        return [
+            driven(
+                f"{name}, {kind} odometer{begins}",
+                happens=_at(
+                    range(BEGIN_NS + int(begins_s * 1e9), 2**62, 2**62),
+                    lambda world, reads=reads: world.rewire(acts, **reads),
+                ),
+                faults=faults,
+                begins_s=begins_s,
+                bases=bases,
+            )
+            for kind, reads in told.items()
+            for begins_s, begins in ((0.0, " from the start"), (BEGIN_S, ""))
+        ]
+
+    def like(acts: Callable[[_Numbers], _Numbers]) -> Callable[..., _Numbers]:
+        """An odometer that is wired as the motors are."""
+        return lambda read, command: acts(read)
+
+    def swapped(numbers: _Numbers) -> _Numbers:
+        return numbers[1], numbers[0], numbers[2]
+
+    def steered(read: _Numbers, command: _Numbers) -> _Numbers:
+        return read[0], command[0]
+
+    def stuck_at(steering_rad: float) -> Callable[[_Numbers], _Numbers]:
+        return lambda command: (steering_rad, command[1])
+
+    def unsigned(read: _Numbers, command: _Numbers) -> _Numbers:
+        return abs(read[0]), read[1]
+
+    car, bases = ("ackermann",), BASES[1:]
+    drive, left, turn = (
+        Fault.DRIVE_CONTRADICTED, Fault.SIDEWAYS_CONTRADICTED, Fault.TURN_CONTRADICTED
+    )  # fmt: skip
+    ahead, aside, around = _signed(-1, 1, 1), _signed(1, -1, 1), _signed(1, 1, -1)
+    return [
+        *wired("steering reversed", turn, _signed(-1, 1), steered, car),
+        *wired("servo dead at 0", turn, stuck_at(0.0), steered, car),
+        *wired("servo dead at 0.3 rad", turn, stuck_at(0.3), steered, car),
+        *wired("motor reversed", drive, _signed(1, -1), unsigned, car),
+        *wired("ahead reversed", drive, ahead, like(ahead), bases),
+        *wired("left reversed", left, aside, like(aside), ("omni",)),
+        *wired("turn reversed", turn, around, like(around), ("differential",)),
+        *wired("ahead and left swapped", drive | left, swapped, like(swapped), ("omni",)),
+    ]
+
+
+def _gyros() -> list[FaultRow]:
+    """Rows in which a gyro lies from the start, with four seconds in which no marker is seen."""
+
+    def lies(name: str, edit: Callable[[], Callable[[float], float]]) -> FaultRow:
+        def dark() -> Change:
+            blind = inject.frames(inject.nothing_seen)
+            return inject.both(inject.gyro(edit()), inject.between(5.0, 9.0, blind))
+
+        return FaultRow(
+            name, dark, Fault.GYRO_CONTRADICTED | Fault.GYRO_INVALID,
+            health=(Health.OK, Health.STOP), error_m=0.3,
+            begins_s=0.0, ends_s=_LATEST, bases=BASES[:2], gyro=True, lied_m=0.0, named_m=0.5,
+            drive_s=12.0,
+        )  # fmt: skip
+
+    def noisy() -> Callable[[float], float]:
+        rng = np.random.default_rng(0)
+        return lambda rate_radps: rate_radps + float(rng.standard_normal())
+
+    return [
+        lies("a gyro stuck at 0", lambda: lambda rate_radps: 0.0),
+        lies("a gyro of the wrong sign", lambda: lambda rate_radps: -rate_radps),
+        lies("a gyro in degrees", lambda: np.rad2deg),
+        lies("a gyro with 1 rad/s of noise", noisy),
     ]

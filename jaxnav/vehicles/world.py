@@ -3,6 +3,7 @@
 import math
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -91,6 +92,8 @@ class SimWorld:
         self._written_ns = self._gyro_ns = begin_ns
         self._gyro = None if vehicle.gyro is None else _Gyro.switched_on(vehicle.gyro, seed)
         self._held = False
+        self._acts: Callable[[tuple[float, ...]], tuple[float, ...]] = lambda command: command
+        self._reads: Callable[..., tuple[float, ...]] = lambda read, command: read
 
     def write(self, *told: float) -> None:
         """Take a command, which acts after the actuation delay.
@@ -117,6 +120,20 @@ class SimWorld:
         with self._lock:
             self._held = held
 
+    def rewire(
+        self,
+        acts: Callable[[tuple[float, ...]], tuple[float, ...]] = lambda command: command,
+        reads: Callable[..., tuple[float, ...]] = lambda read, command: read,
+    ) -> None:
+        """Connect the actuators and the odometer in another way.
+
+        Args:
+            acts: what acts in place of a command.
+            reads: what is read in place of the true reading while a command is obeyed.
+        """
+        with self._lock:
+            self._acts, self._reads = acts, reads
+
     def move_markers(
         self, by_m: tuple[float, float, float], which: slice = slice(None), scale: float = 1.0
     ) -> None:
@@ -127,6 +144,20 @@ class SimWorld:
             size_m = self.markers.size_m.at[which].multiply(scale)
             self.markers = eqx.tree_at(lambda m: m.size_m, self.markers, size_m)
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
+
+    def copy_markers(self, by: tuple[float, float, float]) -> None:
+        """Somebody hangs up a copy of every marker, moved by (m, m, rad) about the origin."""
+        with self._lock:
+            markers = self.markers
+            Ts = markers.Ts_world_marker.wxyz_xyz
+            turn = T_world_vehicle_from_planar(jnp.asarray(by, Ts.dtype))
+            copies = jax.vmap(lambda T: (turn @ jaxlie.SE3(T)).wxyz_xyz)(Ts)
+            self.markers = MarkerMap(
+                jaxlie.SE3(jnp.concatenate([Ts, copies])),
+                jnp.concatenate([markers.size_m] * 2),
+                markers.ids * 2,
+                markers.families * 2,
+            )
 
     def knock_camera(self, camera: int, turn_rad: tuple[float, float, float]) -> None:
         """Somebody turns a camera about its own axes, by a rotation vector."""
@@ -160,7 +191,9 @@ class SimWorld:
 
     def reading(self, at_ns: int) -> Reading:
         """The reading of the odometer at an instant, without corrections."""
-        return reading_of(at_ns, self.odometry(at_ns), valid=True)
+        read = self.odometry(at_ns)
+        with self._lock:
+            return reading_of(at_ns, self._reads(read, self._obeyed(at_ns)), valid=True)
 
     def odometry(self, at_ns: int) -> tuple[float, ...]:
         """The noisy (speed_mps, steering_rad) of a car's sensors, or another base's twist."""
@@ -222,7 +255,7 @@ class SimWorld:
     def _advance(self, until_ns: int) -> None:
         while self._time_ns < until_ns:
             step_ns = min(_SUBSTEP_NS, until_ns - self._time_ns)
-            command = np.array(self._obeyed(self._time_ns), self._dtype)
+            command = np.array(self._acts(self._obeyed(self._time_ns)), self._dtype)
             dt_s = np.asarray(step_ns / 1e9, self._dtype)
             moved = np.asarray(_moved(self._plant, self._row, command, dt_s))
             if self._held:  # it keeps its pose; a car's wheels are steered nevertheless

@@ -517,6 +517,10 @@ def test_arrays_are_read(tmp_path):
             "map_size: must have the shape (M), for map_ids has M = 0",
         ),
         ({"obj_order": np.zeros((4, 2))}, "a.npz: obj_order: must be"),
+        (
+            {"corners_px": arrays()["corners_px"][:, ::-1]},
+            "a.npz: of 3 detections 3 list their corners the other way round",
+        ),
     ],
     ids=lambda value: str(value)[:30],
 )

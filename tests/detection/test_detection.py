@@ -1,5 +1,6 @@
 """Detectors: which markers they find, and where, on photographs and on drawn scenes."""
 
+import dataclasses
 import importlib
 import re
 
@@ -16,10 +17,12 @@ from jaxnav.detection import (
     observe,
 )
 from jaxnav.detection.lens import Lens
+from jaxnav.detection.observe import are_mirrored, double_area_px2
 from jaxnav.detection.read import read_marker
 from jaxnav.errors import BadInput
 from jaxnav.models.camera import Camera
 from jaxnav.models.markers import FAMILY_SIZES, MarkerMap
+from tests import worlds
 from tests.helpers.marker_images import Scene, random_scene, rotation
 
 BACKENDS = ["aruco", "apriltag"]
@@ -290,3 +293,49 @@ def test_observe_drops_both_of_two_equal_ones():
     observed = observe([some([4, 4, 2]), some([4])], a_map((4, 2), ("tag36h11",) * 2))
     assert observed.visible.tolist() == [[False, True], [True, False]]
     assert observed.duplicates == 2
+
+
+# The order in which a detector may list corners that it does not list TL TR BR BL.
+ANTICLOCKWISE = ([0, 3, 2, 1], [1, 0, 3, 2], [2, 1, 0, 3], [3, 2, 1, 0])
+CLOCKWISE = ([0, 1, 2, 3], [1, 2, 3, 0], [2, 3, 0, 1], [3, 0, 1, 2])
+
+
+@pytest.mark.parametrize("rig", [worlds.qcar_rig(), worlds.handheld_rig()], ids=["qcar", "rig"])
+def test_no_marker_in_view_has_the_winding_of_one_seen_from_behind(rig):
+    """From anywhere, rolled cameras and the edges of wide lenses included, up to 2 px of noise."""
+    rng, markers = np.random.default_rng(0), worlds.room_markers()
+    seen = 0
+    for _ in range(60):
+        turn = jaxlie.SO3.exp(jnp.asarray(rng.normal(size=3) * [0.2, 0.2, 3.0]))
+        place_m = jnp.asarray([*rng.uniform(-1.2, 1.2, 2), rng.uniform(0.0, 0.5)])
+        T = jaxlie.SE3.from_rotation_and_translation(turn, place_m)
+        obs = worlds.observe(rig, markers, T)
+        shown = np.asarray(obs.visible)
+        corners_px = np.asarray(obs.corners_px)[shown]
+        sigma_px = rng.uniform(0.05, 2.0)
+        noisy_px = corners_px + sigma_px * rng.normal(size=corners_px.shape)
+        assert not are_mirrored(noisy_px, np.full((len(noisy_px), 4), sigma_px)).any()
+        large = double_area_px2(corners_px) > 20**2
+        for order in ANTICLOCKWISE:
+            assert are_mirrored(noisy_px[large][:, order], np.full((sum(large), 4), 2.0)).all()
+        for order in CLOCKWISE:
+            assert not are_mirrored(noisy_px[:, order], np.full((len(noisy_px), 4), 2.0)).any()
+        seen += len(noisy_px)
+    assert seen > 100
+
+
+def test_a_marker_seen_edge_on_is_not_mirrored_by_its_noise():
+    """Its corners lie on a line: half of the draws have the other winding."""
+    rng, sigma_px = np.random.default_rng(1), np.full((100_000, 4), 0.5)
+    line_px = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 30.0], [0.0, 30.0]])
+    drawn_px = line_px + 0.5 * rng.normal(size=(len(sigma_px), 4, 2))
+    assert 0.4 < np.mean(double_area_px2(drawn_px) < 0) < 0.6
+    assert not are_mirrored(drawn_px, sigma_px).any()
+
+
+def test_observe_drops_what_is_listed_the_other_way_round():
+    right_px = np.array([[0.0, 0.0], [30.0, 0.0], [30.0, 30.0], [0.0, 30.0]])
+    found = dataclasses.replace(some([4, 2]), corners_px=np.stack([right_px, right_px[::-1]]))
+    observed = observe([found], a_map((4, 2), ("tag36h11",) * 2))
+    assert observed.visible.tolist() == [[True, False]]
+    assert observed.mirrored == 1

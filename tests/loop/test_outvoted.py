@@ -1,10 +1,19 @@
-"""A marker that others have outvoted does not count while it is alone in view."""
+"""A marker that others have outvoted does not count while it is alone in view, nor does an id that
+two cameras see at two places."""
 
+import dataclasses
+
+import jaxlie
 import numpy as np
 import pytest
 
+from jaxnav.belief.selectors import make_selector
+from jaxnav.loop.chassis import Motion
 from jaxnav.loop.history import EventData
-from jaxnav.loop.outvoted import MarkerVotes
+from jaxnav.loop.outvoted import MarkerVotes, Twins
+from jaxnav.loop.standstill import Way
+from jaxnav.navigator import Navigator
+from tests import worlds
 
 IDS = (7, 3, 12)
 
@@ -71,3 +80,115 @@ def test_frames_that_show_too_few_do_not_count():
         votes.count(told(0, 1), voted(0))
     assert votes.outvoted == ()
     assert votes.remove_outvoted(alone) is alone
+
+
+MS = 1_000_000
+RIG, MARKERS = worlds.qcar_rig(), worlds.paper_markers()
+TURN_M = (2.0, -1.6, np.pi)  # brings a copy behind the vehicle at its start
+ELSEWHERE = worlds.planar(*TURN_M).inverse()  # whoever sees the copy there sees the marker here
+
+
+def twins(rig=RIG) -> Twins:
+    selector = make_selector("paper-cost")
+    return Twins(Navigator(rig=rig, markers=MARKERS, vehicle=worlds.qcar(), selector=selector))
+
+
+def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int = 0) -> EventData:
+    """What the cameras see from (x_m, y_m, psi_rad), some of them of the copy alone."""
+    rng, T = np.random.default_rng(seed), worlds.planar(*place)
+    truth, copy = worlds.observe(RIG, MARKERS, T), worlds.observe(RIG, MARKERS, ELSEWHERE @ T)
+    of_copy = np.isin(np.arange(4), of_copy)[:, None]
+    visible = np.where(of_copy, copy.visible, truth.visible)
+    visible = visible & np.isin(np.arange(4), list(cameras))[:, None]
+    corners_px = np.where(of_copy[:, :, None, None], copy.corners_px, truth.corners_px)
+    corners_px = corners_px + noise_px * rng.standard_normal(corners_px.shape)
+    return EventData(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
+
+
+def standing(until_ns: int) -> Way:
+    way = Way()
+    for stamp_ns in range(0, until_ns + 1, 20 * MS):
+        way.go(stamp_ns, Motion(0.0, 0.0, 0.0))
+    return way
+
+
+def test_one_id_in_two_cameras_at_two_places_is_left_out_from_the_first_frame():
+    watch, way = twins(), standing(400 * MS)
+    both = views(worlds.START_VIEW, of_copy=[2])
+    assert both.visible[:, 0].tolist() == [True, False, True, False]
+    assert watch.remove_twins(both, 20 * MS, way) is None
+    assert watch.seen(20 * MS)
+    # For a while it is not believed of one of them either.
+    alone = views(worlds.START_VIEW, cameras=[0])
+    assert watch.remove_twins(alone, 400 * MS, way) is None
+    assert not watch.seen(2_000 * MS)
+
+
+def test_what_was_contradicted_often_comes_back_when_cameras_agree():
+    watch, way = twins(), standing(1_000 * MS)
+    for frame in range(8):
+        assert watch.remove_twins(views(worlds.START_VIEW, of_copy=[2]), 20 * MS, way) is None, (
+            frame
+        )
+    alone, shared = views(worlds.START_VIEW, cameras=[0]), views(worlds.OVERLAP_VIEW)
+    assert watch.remove_twins(alone, 10_000 * MS, way) is None
+    assert watch.seen(10_000 * MS)
+    for _ in range(20):
+        watch.remove_twins(shared, 11_000 * MS, way)
+    assert watch.remove_twins(alone, 12_000 * MS, way) is alone
+
+
+def test_cameras_that_look_in_turn_are_compared_along_the_way():
+    """The vehicle turns between two looks by far more than cameras may differ."""
+    way, rate_radps = Way(), 3.0
+    for stamp_ns in range(0, 201 * MS, 20 * MS):
+        way.go(stamp_ns, Motion(0.0, 0.0, rate_radps))
+    x_m, y_m, psi_rad = worlds.OVERLAP_VIEW
+    later = x_m, y_m, psi_rad + 0.2 * rate_radps
+    first, second = views((x_m, y_m, psi_rad), cameras=[3]), views(later, cameras=[0])
+    assert first.visible.any()
+    assert second.visible.any()
+    watch = twins()
+    watch.remove_twins(first, 0, way)
+    assert watch.remove_twins(second, 200 * MS, way) is second
+    watch = twins()
+    watch.remove_twins(first, 0, standing(200 * MS))
+    assert watch.remove_twins(second, 200 * MS, standing(200 * MS)) is None
+    # Without an odometer nothing is known of the way between.
+    watch = twins()
+    watch.remove_twins(first, 0, Way())
+    assert watch.remove_twins(second, 200 * MS, Way()) is second
+
+
+@pytest.mark.parametrize("noise_px", [0.3, 2.0])
+def test_what_calibration_and_noise_allow_is_one_place(noise_px):
+    """Cameras off by 1 deg and 1 cm, and each of them by 8 deg, wherever two see the marker."""
+    rng, seen = np.random.default_rng(0), 0
+    for draw in range(40):
+        by_rad = np.deg2rad(8.0 if draw % 2 else 1.0)
+        direction = rng.standard_normal((4, 2, 3))
+        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+        camera = np.arange(4) == draw % 4 if draw % 2 else np.ones(4)
+        xi = np.concatenate([0.01 * direction[:, 0], by_rad * direction[:, 1]], axis=1)
+        Ts = RIG.Ts_camera_vehicle @ jaxlie.SE3.exp(xi * camera[:, None])
+        watch = twins(dataclasses.replace(RIG, Ts_camera_vehicle=Ts))
+        for look in range(25):
+            x_m, y_m = rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 0.6)
+            told = views((x_m, y_m, rng.uniform(-np.pi, np.pi)), noise_px=noise_px, seed=look)
+            if told.visible.sum() > 1:
+                watch.remove_twins(told, look * 10_000 * MS, Way())
+                assert not watch.seen(look * 10_000 * MS)
+                seen += 1
+    assert seen > 200
+
+
+def test_a_camera_that_agreed_before_was_knocked_and_is_no_copy():
+    watch, way = twins(), standing(40 * MS)
+    watch.remove_twins(views(worlds.OVERLAP_VIEW), 0, way)
+    both = views(worlds.OVERLAP_VIEW)
+    assert both.visible[:, 0].tolist() == [True, False, False, True]
+    turned = both.corners_px.copy()
+    turned[3, :, :, 0] -= 200.0
+    told = dataclasses.replace(both, corners_px=turned)
+    assert watch.remove_twins(told, 20 * MS, way) is told
+    assert twins().remove_twins(told, 20 * MS, way) is None

@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.loop.chassis import Motion, car_motion
-from jaxnav.loop.ways import Fix, Ways
+from jaxnav.loop.ways import Fix, Ranges, Ways
 
 MS = 1_000_000
 WHEELBASE_M = 0.256
@@ -127,3 +128,89 @@ def test_a_silent_odometer_disputes_nothing_when_it_is_back():
     drive.ways.add_odometry(Motion(0.4, 0.0, 0.0), 0.4, 0.0, 0.2)
     assert not drive.ways.disputed
     assert not drive.step()
+
+
+def looks(
+    ranges: Ranges,
+    scale: float = 1.0,
+    wheels: float = 1.0,
+    toward: float = 1.0,
+    way_m: float = 1.0,
+    begin_m: float = 2.5,
+    noise: float = 0.005,
+    lane: tuple[int, int] = (0, 0),
+    late_s: float = 0.0,
+) -> float | None:
+    """Drive past a marker at 0.5 m/s and 30 Hz; the way after which the files are contradicted.
+
+    Args:
+        scale: of every range.
+        wheels: what the odometer tells of every way.
+        toward: 1 ahead of the vehicle, -1 behind it by a rig that is turned.
+        noise: share of a range, one sigma.
+        late_s: the camera's stamps, while the car speeds up in a third of a second.
+    """
+    rng, told_m, first = np.random.default_rng(0), 0.0, None
+    for index in range(1, round(way_m * 60) + 1):
+        gone_m, speed = index / 60, min(index / 10, 1.0) * 0.5
+        ahead_m, left_m = begin_m - (gone_m - speed * late_s), 0.3 * begin_m
+        factor = toward * scale * (1 + noise * rng.standard_normal())
+        place_m = (factor * ahead_m, factor * left_m, 0.2)
+        if ranges.add_place(lane, place_m, (wheels * gone_m - told_m, 0.0, 0.0)):
+            told_m = wheels * gone_m
+        if ranges.contradicted and first is None:
+            first = gone_m
+    return first
+
+
+@pytest.mark.parametrize(
+    ("scale", "within_m"), [(2.0, 0.3), (0.5, 0.3), (1.5, 0.4), (0.7, 0.5), (1.2, 2.0), (0.8, 2.0)]
+)
+@pytest.mark.parametrize("wheels", [0.97, 1.0, 1.03])
+def test_a_size_that_is_not_as_the_file_says_is_named(scale, within_m, wheels):
+    ranges = Ranges()
+    named_m = looks(ranges, scale, wheels, way_m=2.0)
+    assert named_m is not None
+    assert named_m < within_m
+    assert ranges.slope == pytest.approx(scale / wheels, rel=0.1)
+
+
+def test_a_camera_that_looks_the_other_way_is_named_at_once():
+    assert looks(ranges := Ranges(), toward=-1.0) < 0.2
+    assert ranges.slope == pytest.approx(-1.0, abs=0.1)
+    assert ranges.lasting
+
+
+@pytest.mark.parametrize("wheels", [0.93, 0.97, 1.03, 1.07])
+@pytest.mark.parametrize("noise", [0.002, 0.02, 0.05])
+@pytest.mark.parametrize("late_s", [-0.05, 0.05])
+def test_wheels_noise_and_delays_as_they_are_contradict_nothing(wheels, noise, late_s):
+    ranges = Ranges()
+    assert looks(ranges, 1.02, wheels, noise=noise, late_s=late_s, way_m=2.0) is None
+
+
+def test_wheels_that_slip_later_leave_the_files_alone():
+    ranges = Ranges()
+    looks(ranges)
+    assert looks(ranges, wheels=1.4, begin_m=1.5) is None
+    assert ranges.slope < 0.85
+    # Another camera's file has not agreed with any way yet.
+    assert looks(ranges, wheels=1.4, lane=(1, 0)) is not None
+
+
+def test_it_is_forgotten_once_the_files_agree():
+    ranges = Ranges()
+    looks(ranges, scale=2.0, way_m=0.5)
+    assert ranges.contradicted
+    looks(ranges, lane=(1, 0))
+    assert not ranges.contradicted
+
+
+def test_who_stands_or_is_carried_off_is_told_nothing():
+    ranges = Ranges()
+    for _ in range(1000):
+        ranges.add_place((0, 0), (2.0, 0.1, 0.2), (0.001, 0.0, 0.0))
+    assert not ranges.contradicted
+    assert ranges.sigma == math.inf
+    assert looks(ranges, begin_m=2.0, way_m=0.05) is None
+    assert looks(ranges, begin_m=1.4, way_m=0.5) is None  # from one look to the next

@@ -18,6 +18,7 @@ from jaxnav.loop.interfaces import Frame
 from jaxnav.loop.pilot import Pilot
 from jaxnav.loop.seeing import Region, Search
 from jaxnav.navigator import Navigator, Output
+from jaxnav.simulation.bases import BASES, equipped
 from jaxnav.simulation.rendering import Renderer
 from jaxnav.simulation.scene import Scene
 from jaxnav.simulation.sensor import Sensor
@@ -51,16 +52,48 @@ class Compiled:
         return self.executables[kind](navigator, *told)
 
 
+def trial_of(base: str, imu: str) -> Trial:
+    vehicle = equipped(worlds.qcar(), base, imu)
+    return Trial(worlds.qcar_rig(), worlds.paper_markers(), vehicle, program=Compiled())
+
+
 @pytest.fixture(scope="module", params=["float64", "float32"])
 def trial(request) -> Iterator[Trial]:
     """Compiled once in each precision, in which all rows are then driven."""
     with jax.enable_x64(request.param == "float64"):
-        yield Trial(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), program=Compiled())
+        yield trial_of("ackermann", "none")
 
 
-@pytest.mark.parametrize("row", matrix(), ids=lambda row: row.name)
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def trials(request) -> Iterator[dict[str, Trial]]:
+    """Of every vehicle that has a gyro; the two bases have one compiled program."""
+    with jax.enable_x64(request.param == "float64"):
+        made = {base: trial_of(base, "consumer") for base in BASES}
+        shared = made["differential"].program
+        yield made | {"omni": dataclasses.replace(made["omni"], program=shared)}
+
+
+ROWS = matrix()
+CAR_ROWS = [row for row in ROWS if "ackermann" in row.bases and not row.gyro]
+OTHER_ROWS = [
+    (base, row)
+    for row in ROWS
+    for base in row.bases
+    if row.gyro or base != "ackermann"
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("row", CAR_ROWS, ids=lambda row: row.name)
 def test_every_fault_comes_to_what_it_must(trial, row):
     result = run_trial(row, trial)
+    assert result.broken == (), line(result)
+
+
+@pytest.mark.parametrize(
+    ("base", "row"), OTHER_ROWS, ids=[f"{row.name}-{base}" for base, row in OTHER_ROWS]
+)
+def test_every_fault_of_other_vehicles_comes_to_what_it_must(trials, base, row):
+    result = run_trial(row, trials[base])
     assert result.broken == (), line(result)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxnav.calibration.odometry.drive import Drive
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.reading import given_files, read_shown
+from jaxnav.datasets.recording import check_winding
 from jaxnav.datasets.ros_drives import read_ros_drive
 from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
@@ -103,8 +104,12 @@ def drive_of(
 
     Args:
         corner_sigma_px: of every corner along one axis; by default each detection's own.
+
+    Raises:
+        BadInput: corners are in another order than they should be.
     """
     left_out = 0
+    detected_px = [np.zeros((0, 4, 2))]
     readings: list[tuple[int, float, float]] = []
     views: list[tuple[int, int, int, np.ndarray, np.ndarray]] = []
     looked: set[tuple[int, int]] = set()
@@ -120,6 +125,7 @@ def drive_of(
             if not frame.detections or key in looked or not 0 <= frame.camera < len(rig):
                 continue
             looked.add(key)
+            detected_px.append(frame.detections.corners_px)
             detections = [_NONE] * len(rig)
             detections[frame.camera] = frame.detections
             seen = observe(detections, markers)
@@ -133,6 +139,7 @@ def drive_of(
                     views.append((frame.stamp_ns, frame.camera, int(marker), corners_px, sigma_px))
                 else:
                     left_out += 1
+    check_winding(name, np.concatenate(detected_px))
     read_columns = _columns(readings, 3)
     columns = _columns(views, 5)
     return Drive(

@@ -134,6 +134,12 @@ def route_file(route: Route, vehicle: Vehicle | TwistBase, markers: MarkerMap) -
             f"waypoint_radius_m is {radius_m:g}: the car may pass by and turn round",
             "0.1 to 0.2 m suits a small car",
         )
+    if route.leaves_at_m < (turns_m := 2 * turn_m + radius_m):
+        good = False
+        yield warning(
+            f"leave_m is {route.leaves_at_m:g}: a car that turns round stops",
+            f"its smallest circle takes {turns_m:.2f} m",
+        )
     centers_world_m = np.asarray(markers.Ts_world_marker.translation())
     apart_m = np.linalg.norm(poses[:, None, :2] - centers_world_m[:, :2], axis=-1)
     low = centers_world_m[:, 2] > 0.02  # not on the floor, where one may drive over it

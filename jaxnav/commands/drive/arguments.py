@@ -165,10 +165,11 @@ class Ros(Checked):
 
 @dataclass(frozen=True)
 class Faults(Headless):
-    """Drive the simulated car with every fault of the fault matrix, and print what came of it.
+    """Drive the simulated vehicle with every fault of the fault matrix, and print what came of it.
 
-    Cameras, stamps, odometry, calibration, the world and the loop fail in some fifty ways, one at a
-    time, at corner level. Exit code 1 when one of them did not come to what it must.
+    Cameras, stamps, odometry, actuators, calibration, the world and the loop fail in some ninety
+    ways, one at a time, at corner level; another base than a car is tried in fewer. Exit code 1
+    when one of them did not come to what it must.
     """
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()

@@ -1,10 +1,12 @@
 """`jaxnav faults`: drive with every fault of the matrix, and print a table."""
 
+from dataclasses import asdict
+
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Faults
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
-from jaxnav.files import calib_dir, load_car, load_markers, load_rig, write_json
+from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
 from jaxnav.loop.flags import names
 from jaxnav.testing.faults import HEADER, Result, Trial, line, run_trial
 from jaxnav.testing.matrix import matrix
@@ -19,11 +21,12 @@ def run(args: Faults) -> int:
     trial = Trial(
         load_rig(args.rig or qcar / "rig.yaml"),
         load_markers(args.markers or qcar / "markers.yaml"),
-        load_car(args.vehicle or qcar / "vehicle.yaml"),
+        load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
     )
-    rows = [row for row in matrix() if not args.only or any(p in row.name for p in args.only)]
+    suiting = [row for row in matrix() if row.suits(trial)]
+    rows = [row for row in suiting if not args.only or any(p in row.name for p in args.only)]
     if not rows:
-        known = ", ".join(row.name for row in matrix())
+        known = ", ".join(row.name for row in suiting)
         raise BadInput("--only", f"names no fault: there are {known}")
     results: list[Result] = []
     print(HEADER)
@@ -48,5 +51,6 @@ def _as_json(result: Result) -> dict[str, object]:
         "error_after_m": result.error_after_m,
         "recovered_s": result.recovered_s,
         "restarts": result.restarts,
+        "ways": asdict(result.ways),
         "broken": list(result.broken),
     }

@@ -13,6 +13,7 @@ from jaxnav.calibration.odometry.model import NAMES
 from jaxnav.cli import main
 from jaxnav.commands.calibrate.odometry_recordings import drive_of
 from jaxnav.detection import Detections
+from jaxnav.errors import BadInput
 from jaxnav.files import load_vehicle, save_markers
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Odometry
@@ -80,6 +81,13 @@ def test_a_recording_gives_back_what_was_sensed():
     read = drive_of("drive", inputs_of(drive), worlds.qcar_rig(), worlds.paper_markers())
     for field in dataclasses.fields(Drive):
         np.testing.assert_array_equal(getattr(read, field.name), getattr(drive, field.name))
+
+
+def test_corners_in_another_order_calibrate_nothing():
+    drive = sensed_drive()
+    inputs = inputs_of(dataclasses.replace(drive, corners_px=drive.corners_px[:, ::-1]))
+    with pytest.raises(BadInput, match="list their corners the other way round"):
+        drive_of("drive", inputs, worlds.qcar_rig(), worlds.paper_markers())
 
 
 def test_a_drive_becomes_a_vehicle_a_report_and_a_picture(capsys, tmp_path, recording):

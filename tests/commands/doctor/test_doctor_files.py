@@ -222,8 +222,8 @@ def test_figures_of_no_small_car(change, words):
     assert words in the_problem(vehicle_file(vehicle), "warning").what
 
 
-def route(*waypoints_m, radius_m=0.15, start=ROUTE.start_pose) -> Route:
-    return Route(waypoints_m, radius_m, start)
+def route(*waypoints_m, radius_m=0.15, start=ROUTE.start_pose, leave_m=None) -> Route:
+    return Route(waypoints_m, radius_m, start, leave_m)
 
 
 @pytest.mark.parametrize(
@@ -231,6 +231,7 @@ def route(*waypoints_m, radius_m=0.15, start=ROUTE.start_pose) -> Route:
     [
         (route((1.3, 0.0), (1.3, 0.1)), "warning", "waypoint 2 is 0.10 m from the place before"),
         (route((1.3, 0.0), radius_m=0.01), "warning", "waypoint_radius_m is 0.01"),
+        (route((1.3, 0.0), leave_m=0.5), "warning", "leave_m is 0.5: a car that turns round stops"),
         (route((0.0, 1.3)), "warning", "past marker 0 at 0.17 m"),
     ],
 )

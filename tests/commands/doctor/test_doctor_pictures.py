@@ -196,7 +196,7 @@ def test_corners_of_curled_paper_are_those_of_no_square(bent_px, level):
     seen = observe(RIG, markers, planar(*POSE))
     corners_px = np.array(seen.corners_px)
     corners_px[:, :, 0] += bent_px
-    told = CornerLanes(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0)
+    told = CornerLanes(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0, 0)
     _, (pose,), findings = in_their_order(Sighted.of(RIG, markers, told, 6), ROUTE)
     assert findings[-1].level == level
     assert ("off those of any square" in findings[-1].what) == (level == "warning")
