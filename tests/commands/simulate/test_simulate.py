@@ -13,8 +13,9 @@ from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
 from jaxnav.commands.kinds import Scenario, Selector, SimulatedSelector
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
-from jaxnav.commands.simulate.simulate import _load, _navigator
-from jaxnav.files import write_params
+from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.commands.simulate.simulate import _navigator
+from jaxnav.files import load_params, write_params
 from jaxnav.parameters import parameters_of
 from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.simulation.rollout import Trace
@@ -176,7 +177,8 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
         tmp_path / "p.yaml",
         {"corner_sigma_px": 3.0, "motion.tilt_sigma_rad": 0.5, "motion.height_sigma_m": 0.25},
     )
-    car = _load(Arguments(params=tmp_path / "p.yaml"), SCENARIO)
+    path = tmp_path / "p.yaml"
+    car = ScenarioCar.load(Arguments(params=path), load_params(path))
     found = parameters_of(_navigator(car, SCENARIO, "mahalanobis", px))
     assert float(found["corner_sigma_px"]) == px
     assert float(found["motion.tilt_sigma_rad"]) == 0.5  # before what the scenario tells
@@ -184,7 +186,7 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
 
 
 def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
-    car = _load(Arguments(), SCENARIO)
+    car = ScenarioCar.load(Arguments())
     for name in ("lowest-reprojection", "paper-cost"):
         gated, ungated = (
             _navigator(car, SCENARIO, name + ending, 1.0) for ending in ("", "-ungated")
