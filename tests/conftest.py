@@ -17,6 +17,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 import tests.helpers.shapes
+from tests.helpers import strangers
 
 # No test is judged by the clock: machines are shared.
 hypothesis.settings.register_profile("shared", deadline=None)
@@ -77,7 +78,7 @@ if "XLA_FLAGS" not in os.environ:
 # A file is one worker's: what takes minutes must not come last.
 LONG = """test_navigator test_hypotheses test_replay test_faults test_tune test_following test_demo
     test_tuning_driving test_rollout test_study_kinds test_studies test_examples test_twist_pilot
-    test_run_base""".split()
+    test_strangers""".split()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -107,6 +108,15 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"no real data in {path}: set JAXNAV_DATA")
     return path
+
+
+@pytest.fixture(scope="session", params=["crawler", "slider"])
+def stranger(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> strangers.Stranger:
+    """Robots that are not the QCar, one after the other: a test that has this runs on each."""
+    made: strangers.Stranger = getattr(strangers, request.param)(tmp_path_factory.mktemp("a lab"))
+    return made
 
 
 @pytest.fixture(params=["float32", "float64"])
