@@ -234,7 +234,10 @@ def test_its_map_is_checked_and_found(stranger, driven, here, tmp_path):
     [
         ("calibrate odometry DRIVE", "header.vehicle.base: must be ackermann here"),
         ("calibrate adopt DRIVE", "header.vehicle.base: must be ackermann here"),
-        ("calibrate rig DRIVE --vehicle-frame drive --vehicle VEHICLE", "base: must be ackermann"),
+        (
+            "calibrate rig DRIVE --vehicle-frame drive --vehicle VEHICLE",
+            ("base: must be ackermann here", "mast/lookout is the rig's only camera"),
+        ),
         ("demo --rig RIG --markers MARKERS --vehicle VEHICLE", "base: must be ackermann here"),
         ("faults --vehicle VEHICLE", "base: must be ackermann here"),
         ("simulate --rig RIG --markers MARKERS --vehicle VEHICLE", "--route: no marker of the map"),
@@ -250,5 +253,5 @@ def test_what_it_can_not_do_is_said_in_one_line(
     given = [(files | {"DRIVE": driven.path}).get(word, word) for word in arguments.split()]
     code, out, err = here(*given, *([] if "rig" in given[:2] else ["--headless"]))
     assert (code, out, err.count("\n")) == (EXIT_BAD_INPUT, "", 1)
-    assert words in err
+    assert any(one in err for one in ((words,) if isinstance(words, str) else words))
     assert not list(tmp_path.iterdir())
