@@ -110,7 +110,7 @@ def data_dir() -> Path:
     return path
 
 
-@pytest.fixture(scope="session", params=["crawler", "slider"])
+@pytest.fixture(scope="module", params=["crawler", "slider"])
 def stranger(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> strangers.Stranger:
