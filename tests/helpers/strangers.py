@@ -12,8 +12,9 @@ from pathlib import Path
 
 import jax
 
+from tests.helpers.late import MAIN
+
 ROOT = Path(__file__).resolve().parents[2]
-MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 
 # Far from the QCar's place, two walls that meet, a marker on each. The first robot sees one of
 # them at a time, and neither for a moment where it turns.
