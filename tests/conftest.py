@@ -17,6 +17,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 import tests.helpers.shapes
+from tests.helpers import strangers
 
 # No test is judged by the clock: machines are shared.
 hypothesis.settings.register_profile("shared", deadline=None)
@@ -74,10 +75,14 @@ if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = " ".join(f"--{name}={value}" for name, value in flags.items())
 
 
+from tests.helpers import late  # noqa: E402  (it imports what the hooks see)
+
+late.listen()
+
 # A file is one worker's: what takes minutes must not come last.
 LONG = """test_navigator test_hypotheses test_replay test_faults test_tune test_following test_demo
     test_tuning_driving test_rollout test_study_kinds test_studies test_examples test_twist_pilot
-    test_run_base""".split()
+    test_strangers""".split()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -97,6 +102,15 @@ def let_compiled_code_go() -> Iterator[None]:
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > 20_000:
         jax.clear_caches()
+        late.forget()
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_compiled_while_somebody_waits() -> Iterator[None]:
+    """See `tests/helpers/late.py`."""
+    yield
+    found = late.taken()
+    assert not found, "\n".join(found)
 
 
 @pytest.fixture(scope="session")
@@ -107,6 +121,15 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"no real data in {path}: set JAXNAV_DATA")
     return path
+
+
+@pytest.fixture(scope="module", params=["crawler", "slider"])
+def stranger(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> strangers.Stranger:
+    """Robots that are not the QCar, one after the other: a test that has this runs on each."""
+    made: strangers.Stranger = getattr(strangers, request.param)(tmp_path_factory.mktemp("a lab"))
+    return made
 
 
 @pytest.fixture(params=["float32", "float64"])

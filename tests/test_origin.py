@@ -90,9 +90,7 @@ def test_near_zero_not_a_bit_changes(dtype):
     assert opposite(ZERO) is ZERO
     route = Route(((1.0, -0.0),), 0.1, (0.3, 0.1, 7.0))
     assert route.relative_to(ZERO) == route
-    paper = worlds.paper_markers()
-    assert paper.origin_m == ZERO
-    assert paper.without_origin() is paper
+    assert worlds.paper_markers().origin_m == ZERO
 
 
 @settings(max_examples=50)

@@ -208,6 +208,8 @@ class ScenarioCarFiles(Headless):
     rig: QCarRig = None
     markers: QCarMarkers = None
     vehicle: QCarVehicle = None
+    route: Annotated[Path | None, optional("FILE", "(default: the scenario's own)")] = None
+    """Start and waypoints that go with another marker map."""
 
     def _check(self) -> None:
         named = self.base == "ackermann" or self.vehicle is None

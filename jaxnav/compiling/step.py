@@ -71,12 +71,12 @@ def is_compiled(
 
 
 def strip_static(navigator: Navigator) -> Navigator:
-    """The navigator without its vehicle's sensor corrections and its map's origin: these numbers
-    are static fields, not leaves, and nothing is computed with them."""
+    """The navigator without its vehicle's sensor corrections, its map's origin and its markers'
+    names: these are static fields, not leaves, and nothing is computed with them."""
 
     def without(part: PyTree) -> PyTree:
         if isinstance(part, MarkerMap):
-            return part.without_origin()
+            return part.without_names()
         if not isinstance(part, Vehicle):
             return part
         return replace(

@@ -76,9 +76,14 @@ class Detections:
 
 
 class Detector(Protocol):
-    """Finds the markers of one family in an image."""
+    """Finds the markers of one family in an image.
+
+    Attributes:
+        ids: of the markers whose corners matter; None: of all.
+    """
 
     family: str
+    ids: Collection[int] | None
 
     def detect(
         self,

@@ -121,7 +121,7 @@ class CameraDelays:
 
     def __init__(self, rig: CameraRig, markers: MarkerMap, vehicle: Vehicle):
         """Take the drive's rig, map and vehicle. Delays come beside the vehicle's corrections."""
-        self._world = rig, markers.without_origin(), vehicle.wheelbase_m
+        self._world = rig, markers.without_names(), vehicle.wheelbase_m
         self._dtype = np.asarray(vehicle.wheelbase_m).dtype
         # Bounded memory: half a minute at 30 Hz, and a third of a minute at 50 Hz.
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=1024)

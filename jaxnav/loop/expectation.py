@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
+from jaxnav.compiling.step import strip_static
 from jaxnav.detection.observe import marker_keys
 from jaxnav.loop.expect import Expected, expect_corners, likely_poses
 from jaxnav.loop.pilot import Outcome
@@ -39,7 +40,7 @@ class Expectation:
 
     def __init__(self, navigator: Navigator):
         """Compile now: the threads that look for markers are watched."""
-        self._navigator = navigator
+        self._unnamed = strip_static(navigator)  # as compiled programs have it
         dtype = np.asarray(navigator.corner_sigma_px).dtype
         self._min_covariance = _MIN_COVARIANCE.astype(dtype)
         self._keys = marker_keys(navigator.markers)
@@ -99,6 +100,5 @@ class Expectation:
         return np.asarray(moved_px / ((belief.now_ns - before.now_ns) / 1e9))
 
     def _expected(self, wxyz_xyz: np.ndarray, covariance: np.ndarray) -> Expected:
-        navigator = self._navigator
-        corners = expect_corners(navigator.rig, navigator.markers, wxyz_xyz, covariance)
-        return Expected(*jax.device_get(corners))
+        rig, markers = self._unnamed.rig, self._unnamed.markers
+        return Expected(*jax.device_get(expect_corners(rig, markers, wxyz_xyz, covariance)))

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from jaxnav.belief.bicycle_kalman import planar_poses
 from jaxnav.belief.estimate import Belief
+from jaxnav.compiling.step import strip_static
 from jaxnav.loop.actuation import Actuation
 from jaxnav.loop.camera_votes import CameraVotes
 from jaxnav.loop.chassis import chassis_of, pace_mps, root_of_sum
@@ -177,6 +178,7 @@ class Pilot:
         if navigator.controller is None:
             raise ValueError("a pilot's navigator needs a vehicle and waypoints")
         self.navigator = navigator
+        self._unnamed = strip_static(navigator)  # as compiled programs have it
         self._origin_m = navigator.markers.origin_m
         self._chassis = chassis_of(navigator.controller.vehicle)
         self.limits = self._chassis.limits
@@ -223,7 +225,7 @@ class Pilot:
     def warm_up(self) -> None:
         """Compile the programs without changing the pilot's state."""
         self._estimator.warm_up()
-        due_px(self.navigator, np.zeros(3), (0.0, 0.0, 0.0))
+        due_px(self._unnamed, np.zeros(3), (0.0, 0.0, 0.0))
         self._twins.warm_up()
 
     def handle(self, given: Input) -> Outcome:
@@ -437,7 +439,7 @@ class Pilot:
         known = self._known
         if self._sure and known is not None and self._camera_votes.open(stamp_ns):
             x_m, y_m, psi_rad = known.pose.tolist()
-            due_px = quads_px(self.navigator, (x_m, y_m, psi_rad))
+            due_px = quads_px(self._unnamed, (x_m, y_m, psi_rad))
             self._camera_votes.count(data, due_px, stamp_ns)
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
@@ -495,7 +497,7 @@ class Pilot:
     def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
         """See `due_px`."""
         known = self._known
-        return due_px(self.navigator, known.pose if known and known.located else None, motion)
+        return due_px(self._unnamed, known.pose if known and known.located else None, motion)
 
     def _slept(self, now_ns: int) -> Fault:
         """Start anew if the loop paused for so long that its belief is out of date."""

@@ -70,9 +70,11 @@ class MarkerMap(eqx.Module):
         centers_m = transform_points(T_world_vehicle.inverse(), centers_world_m)[:, :2]
         return centers_m[jnp.argmin(jnp.sum(centers_m**2, axis=1))]
 
-    def without_origin(self) -> "MarkerMap":
-        """The map with the same numbers and `origin_m` zero, so all origins share a program."""
-        return self if self.origin_m == ZERO else dataclasses.replace(self, origin_m=ZERO)
+    def without_names(self) -> "MarkerMap":
+        """The map with the same numbers, its ids counted from 0, no families and `origin_m` zero:
+        nothing is computed with them, so that all maps of so many markers share a program."""
+        ids = tuple(range(len(self.ids)))
+        return dataclasses.replace(self, ids=ids, families=("",) * len(ids), origin_m=ZERO)
 
     def index(self, marker_id: int, family: str) -> int | None:
         """Index of a marker along the M axis, None if the map lacks it."""

@@ -14,7 +14,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 
 from jaxnav.belief.ambiguity import Ungated
 from jaxnav.belief.bicycle_kalman import BicycleKalman
@@ -210,6 +210,11 @@ def _draw_sigma(axes: Axes, outcomes: Outcomes) -> None:
     shown = outcomes.located & (variances_m2 > 0)
     sigma_mm = 1e3 * np.sqrt(np.where(shown, variances_m2, np.nan))
     axes.semilogy(outcomes.times_s, sigma_mm, color=GREEN, lw=1.2)
+    # Within a decade or so matplotlib writes out every minor tick, one over the other.
+    few = shown.any() and np.nanmax(sigma_mm) < 30 * np.nanmin(sigma_mm)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")
     axes.set_ylabel("position\nsigma (mm)")
 
 

@@ -277,7 +277,7 @@ def _image_message(item: _Item) -> dict[str, Any]:
     seconds, nanoseconds = divmod(max(item.stamp_ns, 0), 10**9)
     return {
         "timestamp": {"sec": seconds, "nsec": nanoseconds},
-        "frame_id": item.topic.rpartition("/")[2],
+        "frame_id": item.topic.removeprefix("/camera/"),
         "data": base64.b64encode(jpeg).decode(),
         "format": "jpeg",
     }

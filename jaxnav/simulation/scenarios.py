@@ -1,6 +1,7 @@
 """Define the scenarios of `jaxnav simulate`, by name."""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -159,6 +160,27 @@ def on_laps(scenario: Scenario, laps: int) -> Scenario:
         waypoints_m=_LAP_M * laps,
         duration_s=40.0 + 30.0 * laps,
         scored_after_s=(20.0, 60.0)[: laps // 2],
+    )
+
+
+def on_route(
+    scenario: Scenario,
+    waypoints_m: Sequence[tuple[float, float]],
+    start_pose: tuple[float, float, float],
+) -> Scenario:
+    """A scenario driven on this route instead of its own, on a floor that reaches 2 m beyond it.
+
+    The time is a lap's for its length, 5 s a metre, where that is more than the scenario's.
+    """
+    places_m = np.array([start_pose[:2], *waypoints_m])
+    (x_min, y_min), (x_max, y_max) = places_m.min(axis=0) - 2.0, places_m.max(axis=0) + 2.0
+    length_m = float(np.linalg.norm(np.diff(places_m, axis=0), axis=1).sum())
+    return dataclasses.replace(
+        scenario,
+        waypoints_m=tuple((float(x), float(y)) for x, y in waypoints_m),
+        start_pose=start_pose,
+        duration_s=max(scenario.duration_s, 5.0 * length_m * scenario.drives),
+        floor_m=(float(x_min), float(x_max), float(y_min), float(y_max)),
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxnav.loop.interfaces import Setup
+from jaxnav.loop.limits import limits_of
 from jaxnav.vehicles import sim
 from jaxnav.vehicles.world import SimWorld
 
@@ -13,23 +14,25 @@ NAME = f"{__name__}:open_vehicle"
 
 
 class RecordedVehicle(sim.SimVehicle):
-    """Each line of the file: when, `time.monotonic_ns()`, and the throttle."""
+    """Each line of the file: when, `time.monotonic_ns()`, what it was told, and its true pose."""
 
     def __init__(self, world: SimWorld, path: str):
         super().__init__(world)
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 
-    def write(self, steering_rad: float, throttle: float) -> None:
-        super().write(steering_rad, throttle)
-        self._tell(throttle)
+    def write(self, *command: float) -> None:
+        super().write(*command)
+        self._tell(command)
 
     def stop(self) -> None:
         super().stop()
-        self._tell(0.0)
+        self._tell(limits_of(self.world.vehicle).zero)
 
-    def _tell(self, throttle: float) -> None:
+    def _tell(self, command: tuple[float, ...]) -> None:
+        now_ns = time.monotonic_ns()
+        numbers = [*command, *map(float, self.world.state(now_ns)[:3])]
         # One call, so that lines of several threads do not mix and outlive the process.
-        os.write(self._file, f"{time.monotonic_ns()} {throttle!r}\n".encode())
+        os.write(self._file, f"{now_ns} {' '.join(map(repr, numbers))}\n".encode())
 
 
 def open_vehicle(setup: Setup) -> RecordedVehicle:
@@ -42,10 +45,16 @@ setattr(open_vehicle, "shares_process", True)  # noqa: B010  (the cameras of sim
 
 @dataclass(frozen=True)
 class Word:
-    """What the vehicle was told."""
+    """What the vehicle was told.
+
+    Attributes:
+        throttle: of a car; of another base the largest part of its twist.
+        pose: where it truly was, x_m, y_m, psi_rad.
+    """
 
     stamp_ns: int
     throttle: float
+    pose: tuple[float, ...] = ()
 
 
 def words(path: Path) -> list[Word]:
@@ -53,5 +62,10 @@ def words(path: Path) -> list[Word]:
     if not path.exists():
         return []
     whole_lines = path.read_text().rpartition("\n")[0].splitlines()
-    pairs = (line.split() for line in whole_lines)
-    return [Word(int(stamp), float(throttle)) for stamp, throttle in pairs]
+    return [_word(*line.split()) for line in whole_lines]
+
+
+def _word(stamp: str, *numbers: str) -> Word:
+    *command, x_m, y_m, psi_rad = map(float, numbers)
+    throttle = command[1] if len(command) == 2 else max(map(abs, command))
+    return Word(int(stamp), throttle, (x_m, y_m, psi_rad))

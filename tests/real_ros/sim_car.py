@@ -9,7 +9,9 @@ true pose on /truth; it obeys /drive, and stops by itself 0.5 s after the last c
                base_footprint -> base_link on /tf_static
     --images   sends rendered pictures on /NAME/image_raw instead of detections
     --vehicle=FILE   is a base that is no car: it obeys /cmd_vel, and tells its gyro on /imu, which
-               is mounted upside down
+               is mounted upside down. --rig=FILE, --markers=FILE, --route=FILE are likewise in
+               place of the QCar's
+    --ros-args WORDS   last: other names of topics, say
 """
 
 import math
@@ -24,6 +26,7 @@ import numpy as np
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.loop.chassis import car_motion
 from jaxnav.loop.interfaces import Odometry, Setup
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
 from jaxnav.ros.connection import Connection, message_type
 from jaxnav.ros.lenses import CAMERA_INFO
@@ -65,10 +68,15 @@ class SimTime:
             time.sleep(0.005 if self.stands else left_ns / 1e9)
 
 
+def topic_of(camera, what):
+    """The topic of a camera, whose name may hold what that of a topic may not."""
+    return f"/{camera.replace('-', '_')}/{what}"
+
+
 def tell_lenses(ros, rig, over):
     """Publish the camera_info of each camera, five times a second."""
     kind = message_type(CAMERA_INFO)
-    topics = [ros.publisher(CAMERA_INFO, f"/{name}/camera_info") for name in rig.names]
+    topics = [ros.publisher(CAMERA_INFO, topic_of(name, "camera_info")) for name in rig.names]
     while not over.wait(0.2):
         for c, topic in enumerate(topics):
             camera = rig.camera(c)
@@ -90,19 +98,21 @@ def main(words):
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: over.set())
     qcar = calib_dir() / "qcar"
-    rig, route = load_rig(qcar / "rig.yaml"), load_route(qcar / "route.yaml")
-    named = [word.removeprefix("--vehicle=") for word in words if word.startswith("--vehicle=")]
-    vehicle_model = load_vehicle(named[0] if named else qcar / "vehicle.yaml")
+    files = {kind: qcar / f"{kind}.yaml" for kind in ("rig", "markers", "vehicle", "route")}
+    files |= dict(word[2:].split("=", 1) for word in words if word[2:].split("=")[0] in files)
+    rig, route = load_rig(files["rig"]), load_route(files["route"])
+    vehicle_model, markers = load_vehicle(files["vehicle"]), load_markers(files["markers"])
+    twisted = isinstance(vehicle_model, TwistBase)
     kind = IMAGE if "--images" in words else APRILTAG_ROS
     # A busy machine has no time for 30 frames a second beside the gyro's messages.
-    shown = {"rate_hz": "10"} if named else {}
+    shown = {"rate_hz": "10"} if twisted else {}
     if kind == IMAGE:
         shown = {"images": "true", "rate_hz": "8"}
-    markers = load_markers(qcar / "markers.yaml")
     setup = Setup(rig, markers, vehicle_model, route.start_pose, options=shown)
     vehicle = sim.open_vehicle(setup)
     cameras = sim.open_cameras(setup, vehicle)
-    ros = Connection("sim_car")
+    ros_words = words.index("--ros-args") if "--ros-args" in words else len(words)
+    ros = Connection("sim_car", args=words[ros_words:])
     heard_s = [time.monotonic()]
     time_of = message_type("builtin_interfaces/msg/Time")
 
@@ -120,7 +130,7 @@ def main(words):
 
     def obey(message):
         heard_s[0] = time.monotonic()
-        if named:
+        if twisted:
             vehicle.write(message.linear.x, message.linear.y, message.angular.z)
             return
         per_throttle_mps = float(vehicle_model.speed_per_throttle_mps)
@@ -133,16 +143,18 @@ def main(words):
                 stamp = stamp_of(frame.stamp_ns)
                 ros.publish(publisher, message_of(kind, camera.name, frame, stamp))
 
-    ros.listen(*(("geometry_msgs/msg/Twist", "/cmd_vel") if named else (ACKERMANN, "/drive")), obey)
+    told = ("geometry_msgs/msg/Twist", "/cmd_vel") if twisted else (ACKERMANN, "/drive")
+    ros.listen(*told, obey)
     imu = ros.publisher(IMU, "/imu")
     odom = ros.publisher(NAV_ODOMETRY, "/odom")
     truth = ros.publisher("geometry_msgs/msg/PoseStamped", "/truth")
     ros.run()
     if clocked:
         threading.Thread(target=tick, daemon=True).start()
-    threading.Thread(target=tell_lenses, args=(ros, rig, over), daemon=True).start()
+    if set(rig.cameras.lenses) == {"equidistant"}:
+        threading.Thread(target=tell_lenses, args=(ros, rig, over), daemon=True).start()
     for camera in cameras:
-        publisher = ros.publisher(kind, f"/{camera.name}/{TOPICS[kind]}")
+        publisher = ros.publisher(kind, topic_of(camera.name, TOPICS[kind]))
         threading.Thread(target=look, args=(camera, publisher), daemon=True).start()
     if "--tf" in words:
         twist, tf = ros.publisher(TWIST_WITH_COVARIANCE, "/twist"), ros.publisher(TF, "/tf")
@@ -172,7 +184,7 @@ def main(words):
         message.header.frame_id, message.child_frame_id = "odom", "base_link"
         place(message.pose.pose, x_m, y_m, psi_rad)
         message.twist.twist.linear.x, message.twist.twist.angular.z = forward_mps, rate_radps
-        if named:  # of a car the velocity at the rear axle
+        if twisted:  # of a car the velocity at the rear axle
             message.twist.twist.linear.y = left_mps
         ros.publish(odom, message)
         if "--tf" in words:

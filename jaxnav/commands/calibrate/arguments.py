@@ -47,7 +47,15 @@ MarkerSize = Annotated[
     ),
     within("size_m"),
 ]
-Family = Annotated[str, tyro.conf.arg(help="Marker family, where the recording does not tell.")]
+Family = Annotated[
+    str | None,
+    optional(
+        "NAME",
+        "(default: the map's, or tag36h11)",
+        str,
+        "Marker family, where the recording does not tell.",
+    ),
+]
 OdometryParameter = Literal[
     "speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s"
 ]
@@ -280,7 +288,7 @@ class CalibrateRig(_Seen):
     """Markers whose places are known, one at least: they tie the world down. By default those that
     a drive brings along; without any the world is the frame of the marker seen most."""
     marker_size_m: MarkerSize = None
-    family: Family = "tag36h11"
+    family: Family = None
     refine_lenses: Switch = False
     """Adjust focal lengths, centres and lenses as well, from where the rig has them."""
     vehicle_frame: Annotated[str, tyro.conf.arg(metavar="places|drive|CAMERA")] = "places"
@@ -306,7 +314,7 @@ class CalibrateMarkers(_Seen):
     """Markers whose places are known, one at least. By default those that a drive brings along;
     without any the world is the frame of the marker seen most."""
     marker_size_m: MarkerSize = None
-    family: Family = "tag36h11"
+    family: Family = None
     out: ResultsFolder = Path("calibrated")
 
 
@@ -325,7 +333,7 @@ class CalibrateCheck(_Seen):
     """Cameras, in place of the recording's own."""
     markers: OptionalFile = None
     """Map to be checked, in place of the one that a drive brings along."""
-    family: Family = "tag36h11"
+    family: Family = None
     tolerance_m: Positive = 0.02
     """A marker that is no further off than this, and no more than its sigma explains, is right."""
     tolerance_deg: Positive = 3.0

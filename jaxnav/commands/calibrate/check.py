@@ -43,6 +43,13 @@ def run(args: Arguments) -> int:
         args.tolerance_m,
         np.deg2rad(args.tolerance_deg),
     )
+    linked = sum(verdict.apart_m is not None for verdict in check.verdicts.values())
+    if linked < 2 and all(verdict.right for verdict in check.verdicts.values()):
+        raise BadInput(
+            args.recordings[0],
+            "no two markers of the map are linked, so that nothing can contradict it: two must be "
+            "in view at once now and then, by any cameras",
+        )
     calibration = moved_world(calibration, check.T_map_world)
     out = output_folder(args.out)
     calibrated = provenance(data, "check")

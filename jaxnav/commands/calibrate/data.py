@@ -47,7 +47,7 @@ def read_rig_data(
     rig_file: Path | None,
     markers_file: Path | None,
     marker_size_m: float | None,
-    family: str,
+    family: str | None,
     only_known: bool = False,
 ) -> RigData:
     """Read all recordings and join their sightings, one recording after the other.
@@ -58,7 +58,7 @@ def read_rig_data(
     Raises:
         BadInput: names the file or the flag.
     """
-    if family not in FAMILY_SIZES:
+    if family is not None and family not in FAMILY_SIZES:
         raise BadInput("--family", f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
     rig = None if rig_file is None else load_rig(rig_file)
     markers = None if markers_file is None else load_markers(markers_file)
@@ -66,6 +66,9 @@ def read_rig_data(
     _one_rig(parts, recordings)
     if markers is None:
         markers = next((part.markers for part in parts if part.markers is not None), None)
+    if family is None:
+        of_map = set() if markers is None else set(markers.families)
+        family = of_map.pop() if len(of_map) == 1 else "tag36h11"
     seen = Counter(key for part in parts for key in _keys(part, family))
     keys = tuple(sorted(key for key in seen if _wanted(key, seen[key], markers, only_known)))
     if not keys:

@@ -62,7 +62,7 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
         if path.is_dir() or path.suffix != ".mcap":
             problem = "is no recording of jaxnav (.mcap): a ROS bag needs --topics"
             raise BadInput(path, problem)
-        logs.append(read_shown(path))
+        logs.append(read_shown(path, args.headless))
     for log in logs[1:]:
         for key in _SHARED:
             if flags[key] is None and log.header.get(key) != logs[0].header.get(key):

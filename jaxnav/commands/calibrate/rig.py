@@ -35,6 +35,9 @@ def run(args: Arguments) -> int:
     configure_jax(float64=True)
     data = read_rig_data(args.recordings, args.rig, args.markers, args.marker_size_m, args.family)
     names = data.rig.names
+    if len(names) < 2:
+        problem = f"{names[0]} is the rig's only camera: `calibrate markers` finds the markers"
+        raise BadInput(", ".join(map(str, args.recordings)), problem)
     ties = ("places", "drive", *names)
     if args.vehicle_frame not in ties:
         problem = f"must be one of {', '.join(ties)}, got {args.vehicle_frame!r}"
@@ -125,10 +128,10 @@ def _refuse_nonsense(
 
 def _wheelbase_m(args: Arguments, data: RigData) -> float:
     """The wheelbase, m, that a drive needs; refuses other recordings before any work is done."""
-    if len(data.parts) != 1 or not any(one.valid for one in data.parts[0].odometry):
-        problem = "needs one recording, of a drive with odometry (a .mcap)"
-        raise BadInput("--vehicle-frame drive", problem)
     vehicle = load_car(args.vehicle or calib_dir() / "qcar" / "vehicle.yaml")
+    if len(data.parts) != 1 or not any(one.valid for one in data.parts[0].odometry):
+        problem = "needs one recording, of a car's drive with odometry (a .mcap)"
+        raise BadInput("--vehicle-frame drive", problem)
     return float(vehicle.wheelbase_m)
 
 

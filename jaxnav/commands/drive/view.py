@@ -54,4 +54,4 @@ def show_drive(view: RerunView, log: DriveLog, scenery: Scenery, headless: bool)
         if frame.detections is not None:
             view.image(name, frame.stamp_ns, None, frame.detections.corners_px)
     for image in log.images():
-        view.image(image.topic.rpartition("/")[2], image.stamp_ns, image.jpeg, None)
+        view.image(image.topic.removeprefix("/camera/"), image.stamp_ns, image.jpeg, None)

@@ -76,10 +76,10 @@ class Simulate(ScenarioCarFiles):
 
     Prints a table, one row for each selector and noise level. A drive succeeds when the true car
     has passed within 0.30 m of every waypoint in order, in 40 s (and 30 s for each lap), without
-    leaving the 5 x 5 m floor; parked, when its last pose is not the wrong one. A pose is wrong when
-    its heading is off by more than 20 degrees. Position error and ANEES (3 degrees of freedom) are
-    those of poses that are decided; on two laps also those of the poses after 20 s, on four those
-    after 60 s.
+    leaving the floor, 5 x 5 m or 2 m beyond --route; parked, when its last pose is not the wrong
+    one. A pose is wrong when its heading is off by more than 20 degrees. Position error and ANEES
+    (3 degrees of freedom) are those of poses that are decided; on two laps also those of the poses
+    after 20 s, on four those after 60 s.
     """
 
     scenario: Scenario = "paper"
@@ -108,6 +108,7 @@ class Simulate(ScenarioCarFiles):
 
     def _check(self) -> None:
         super()._check()
+        require(not self.laps or self.route is None, "--laps", "takes the place of --route")
         require(self.laps <= 100, "--laps", f"must be at most 100, got {self.laps}")
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")

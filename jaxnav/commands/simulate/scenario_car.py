@@ -2,27 +2,47 @@
 
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
+
 from jaxnav.belief.ambiguity import Selector
 from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.commands.kinds import ScenarioCarFiles
-from jaxnav.files import Params, apply_params, calib_dir, load_markers, load_rig, load_vehicle
+from jaxnav.errors import BadInput
+from jaxnav.files import (
+    Params,
+    Route,
+    apply_params,
+    calib_dir,
+    load_markers,
+    load_rig,
+    load_route,
+    load_vehicle,
+)
 from jaxnav.models.bicycle import Vehicle
+from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.models.markers import MarkerMap
 from jaxnav.models.rig import CameraRig
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.bases import equipped
-from jaxnav.simulation.scenarios import Scenario
+from jaxnav.simulation.corners import see
+from jaxnav.simulation.scenarios import Scenario, on_route, scenarios
 
 
 @dataclass(frozen=True)
 class ScenarioCar:
-    """The rig, markers, vehicle and parameters that all scenarios share."""
+    """The rig, markers, vehicle, parameters and route that all scenarios share.
+
+    Attributes:
+        route: in the map's coordinates; None where each scenario drives its own.
+    """
 
     rig: CameraRig
     markers: MarkerMap
     vehicle: Vehicle | TwistBase
     params: Params | None
+    route: Route | None = None
 
     @staticmethod
     def load(files: ScenarioCarFiles, params: Params | None = None) -> "ScenarioCar":
@@ -33,12 +53,34 @@ class ScenarioCar:
         """
         qcar = calib_dir() / "qcar"
         vehicle = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
+        markers = load_markers(files.markers or qcar / "markers.yaml")
+        route = None if files.route is None else load_route(files.route)
         return ScenarioCar(
             rig=load_rig(files.rig or qcar / "rig.yaml"),
-            markers=load_markers(files.markers or qcar / "markers.yaml"),
+            markers=markers,
             vehicle=equipped(vehicle, files.base, files.imu),
             params=params,
+            route=None if route is None else route.relative_to(markers.origin_m),
         )
+
+    def scenario(self, name: str) -> Scenario:
+        """A scenario by its name, on this car's route if it has one.
+
+        Raises:
+            BadInput: no camera sees a marker of the map from its start, where nothing would come
+                of it: its own route is one before the QCar's marker.
+        """
+        scenario = scenarios()[name]
+        if self.route is not None:
+            scenario = on_route(scenario, self.route.waypoints_m, self.route.start_pose)
+        start = jnp.asarray(scenario.start_pose, self.rig.cameras.focal_px.dtype)
+        _, visible = jax.jit(see)(self.rig, self.markers, T_world_vehicle_from_planar(start))
+        if not visible.any():
+            whose = "it"
+            if self.route is None:
+                whose = f"the QCar's route of {name}: give one before your markers"
+            raise BadInput("--route", f"no marker of the map is in view from the start of {whose}")
+        return scenario
 
     def navigator(self, scenario: Scenario, selector: Selector) -> Navigator:
         """The navigator for a scenario; parameters override what the scenario tells.

@@ -24,11 +24,12 @@ from jaxnav.files.writing import plain_data
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scenarios import Scenario, on_laps, scenarios
+from jaxnav.simulation.scenarios import Scenario, on_laps
 from jaxnav.simulation.scores import Drives
 
+_FILES = "rig", "markers", "vehicle", "route", "params"
 # What a result of a version without these keys was made with.
-_OLDER = {"params": None, "laps": 0, "base": "ackermann", "imu": "none"}
+_OLDER = {"params": None, "laps": 0, "base": "ackermann", "imu": "none", "route": None}
 
 
 def run(args: Arguments) -> int:
@@ -43,8 +44,9 @@ def _run(args: Arguments) -> int:
     names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
     wanted = list(itertools.product(names, args.corner_noise_px))
     done = _resumed(args)
-    scenario = _scenario(args)
-    car = _load(args, scenario)
+    params = None if args.params is None else load_params(args.params)
+    car = ScenarioCar.load(args, params)
+    scenario = _scenario(args, car)
     if car.params is not None:
         print(car.params.describe())
     print(_header(scenario))
@@ -61,22 +63,16 @@ def _run(args: Arguments) -> int:
     return 0
 
 
-def _scenario(args: Arguments) -> Scenario:
-    scenario = scenarios()[args.scenario]
-    if args.laps == 0:
-        return scenario
-    if not scenario.drives:
-        raise BadInput("--laps", f"nothing drives in {args.scenario}")
-    return on_laps(scenario, args.laps)
-
-
-def _load(args: Arguments, scenario: Scenario) -> ScenarioCar:
-    params = None if args.params is None else load_params(args.params)
-    car = ScenarioCar.load(args, params)
+def _scenario(args: Arguments, car: ScenarioCar) -> Scenario:
+    scenario = car.scenario(args.scenario)
+    if args.laps:
+        if not scenario.drives:
+            raise BadInput("--laps", f"nothing drives in {args.scenario}")
+        scenario = on_laps(scenario, args.laps)
     if scenario.turns_radps and not isinstance(car.vehicle, TwistBase):
         raise BadInput("--scenario", f"{args.scenario} turns on the spot: needs another --base")
     _navigator(car, scenario, "multi-hypothesis", told_noise_px=1.0)  # raises on bad input
-    return car
+    return scenario
 
 
 def _navigator(
@@ -121,7 +117,7 @@ def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[
         "corner_noise_px": noise_px,
         "told_noise_px": told_noise_px if args.told_noise_px is None else args.told_noise_px,
         "seeds": [args.seed, args.seed + args.seeds - 1],
-    } | {name: plain_data(getattr(args, name)) for name in ("rig", "markers", "vehicle", "params")}
+    } | {name: plain_data(getattr(args, name)) for name in _FILES}
 
 
 def _resumed(args: Arguments) -> list[dict[str, Any]]:

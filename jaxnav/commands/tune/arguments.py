@@ -76,7 +76,11 @@ class TuneFilter(ScenarioCarFiles):
 
     def _check(self) -> None:
         super()._check()
-        for flag, plain in (("--base", self.base == "ackermann"), ("--imu", self.imu == "none")):
+        for flag, plain in (
+            ("--base", self.base == "ackermann"),
+            ("--imu", self.imu == "none"),
+            ("--route", self.route is None),
+        ):
             alone = plain or not self.recordings
             require(alone, flag, "is of simulated drives: recordings tell what drove")
         require(0 <= self.seed < 10**6, "--seed", f"must be from 0 to 999999, got {self.seed}")

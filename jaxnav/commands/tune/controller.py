@@ -22,7 +22,6 @@ from jaxnav.navigator import Navigator
 from jaxnav.parameters import parameters_of
 from jaxnav.plots.tuning import ControllerScores, controller_report
 from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scenarios import scenarios
 from jaxnav.simulation.scores import Drives
 from jaxnav.simulation.statistics import bootstrap_mean, wilson_interval
 from jaxnav.simulation.world import Spread
@@ -80,10 +79,10 @@ def closed_loop(args: Arguments, name: str, params: Params | None = None) -> Clo
     Raises:
         BadInput: a file that is not valid, or a scenario in which nothing drives.
     """
-    scenario = scenarios()[name]
+    car = ScenarioCar.load(args, params)
+    scenario = car.scenario(name)
     if not scenario.drives:
         raise BadInput("--scenario", f"nothing drives in {name}")
-    car = ScenarioCar.load(args, params)
     navigator = car.navigator(scenario, make_selector(args.selector))
     noise_px = jnp.asarray(args.corner_noise_px)
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px, spread=_CARS)

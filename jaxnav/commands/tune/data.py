@@ -27,7 +27,6 @@ from jaxnav.files import load_markers, load_rig
 from jaxnav.navigator import Navigator
 from jaxnav.recording.drive_setup import DriveSetup
 from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scenarios import scenarios
 from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
 
 AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
@@ -68,7 +67,8 @@ def read_data(args: Arguments) -> TuningData:
 
 
 def _simulated(args: Arguments) -> TuningData:
-    car, scenario = ScenarioCar.load(args), scenarios()[args.scenario]
+    car = ScenarioCar.load(args)
+    scenario = car.scenario(args.scenario)
     # The drives are the same whichever estimator is tuned.
     driver = car.navigator(scenario, MultiHypothesis())
     noise_px = jnp.asarray(args.corner_noise_px)

@@ -1,9 +1,6 @@
 """`jaxnav simulate` and `jaxnav reliability`: their counts, and the errors for bad input."""
 
 import json
-import os
-import subprocess
-import sys
 from typing import get_args
 
 import numpy as np
@@ -13,14 +10,16 @@ from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
 from jaxnav.commands.kinds import Scenario, Selector, SimulatedSelector
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
-from jaxnav.commands.simulate.simulate import _load, _navigator
-from jaxnav.files import write_params
+from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.commands.simulate.simulate import _navigator
+from jaxnav.files import load_params, write_params
 from jaxnav.parameters import parameters_of
 from jaxnav.recording.drive_setup import PILOT_SELECTORS
 from jaxnav.simulation.rollout import Trace
 from jaxnav.simulation.scenarios import on_laps, scenarios
 from jaxnav.simulation.scores import Drives
 from jaxnav.simulation.statistics import Reliability
+from tests.helpers.strangers import jaxnav
 
 SCENARIO = scenarios()["paper"]
 
@@ -116,27 +115,19 @@ def test_errors_after_twenty_seconds_count_apart():
     assert not any("after_20s" in name for name in Drives.of(drives, SCENARIO).summary())
 
 
-def simulate(*arguments: str) -> str:
-    """The last line that the command prints. A process of its own: it chooses the precision."""
-    code = "import sys; from jaxnav.cli import main; sys.exit(main())"
-    return subprocess.run(
-        [sys.executable, "-c", code, "simulate", "--headless", *arguments],
-        env=os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.splitlines()[-1]
-
-
-def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path):
+def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path, stranger):
+    """On its own route, and in a process of its own: it chooses the precision."""
     file = tmp_path / "s.json"
-    arguments = ["--seeds", "3", "--selector", "oracle", "--scenario", "approach"]
-    row = simulate(*arguments, "--json", str(file))
+    words = ["--seeds", "3", "--selector", "oracle", *stranger.flags(), "--json", str(file)]
+    ended = jaxnav(stranger.folder, "simulate", *words, "--headless")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    row = ended.stdout.splitlines()[-1]
     result = json.loads(file.read_text())
     assert result["run"]["selector"] == "oracle"
     assert result["success_rate"]["value"] == 1
     assert row.startswith("| oracle | 1 | 100.0% |")
-    assert simulate(*arguments, "--json", str(file), "--resume") == row
+    again = jaxnav(stranger.folder, "simulate", *words, "--headless", "--resume")
+    assert again.stdout.splitlines()[-1] == row
     assert json.loads(file.read_text())["drives"] == 3
 
 
@@ -176,7 +167,8 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
         tmp_path / "p.yaml",
         {"corner_sigma_px": 3.0, "motion.tilt_sigma_rad": 0.5, "motion.height_sigma_m": 0.25},
     )
-    car = _load(Arguments(params=tmp_path / "p.yaml"), SCENARIO)
+    path = tmp_path / "p.yaml"
+    car = ScenarioCar.load(Arguments(params=path), load_params(path))
     found = parameters_of(_navigator(car, SCENARIO, "mahalanobis", px))
     assert float(found["corner_sigma_px"]) == px
     assert float(found["motion.tilt_sigma_rad"]) == 0.5  # before what the scenario tells
@@ -184,7 +176,7 @@ def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
 
 
 def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
-    car = _load(Arguments(), SCENARIO)
+    car = ScenarioCar.load(Arguments())
     for name in ("lowest-reprojection", "paper-cost"):
         gated, ungated = (
             _navigator(car, SCENARIO, name + ending, 1.0) for ending in ("", "-ungated")
@@ -298,6 +290,7 @@ def test_a_result_that_lacks_something_is_not_resumed(tmp_path, capsys):
         (["simulate", "--scenario", "moon"], "moon"),
         (["simulate", "--laps", "-1"], "--laps"),
         (["simulate", "--laps", "101"], "--laps"),
+        (["simulate", "--laps", "1", "--route", "r.yaml"], "--laps: takes the place of --route"),
         (["simulate", "--laps", "1", "--scenario", "static"], "--laps: nothing drives in static"),
         (["simulate", "--markers", "nowhere.yaml"], "nowhere.yaml"),
         (["simulate", "--base", "omni", "--vehicle", "v.yaml"], "--base: omni takes the place of"),

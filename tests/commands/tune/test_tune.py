@@ -43,6 +43,7 @@ FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
         (("filter", "--corner-noise-px", "nan"), "--corner-noise-px: must be positive"),
         (("filter", "nowhere.mcap"), "nowhere.mcap: "),
         (("filter", "drive.mcap", "--imu", "consumer"), "--imu: is of simulated drives"),
+        (("filter", "drive.mcap", "--route", "r.yaml"), "--route: is of simulated drives"),
         (("controller", "--base", "omni", "--vehicle", "v.yaml"), "--base: omni takes the place"),
         (("filter", "--params", "nowhere.yaml"), "nowhere.yaml: "),
         (("controller", "--steps", "0"), "--steps: must be at least 1"),
@@ -81,12 +82,14 @@ def test_a_base_has_gains_and_noise_of_its_own():
         assert {"motion.acceleration_density", "motion.odometry_sigma"} < learned
 
 
-def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("stranger", ["crawler"], indirect=True)
+def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch, stranger):
     """A better loss on what was held out; the same command has nothing left to do, another one is
     refused, and so are parameters that nothing can be learned about."""
     # A driver and a selector without a bank compile in a fifth of the time.
     monkeypatch.setattr("jaxnav.commands.tune.data.MultiHypothesis", LowestReprojection)
     few = (*FEW, "--selector", "lowest-reprojection", "--corner-noise-px", "0.3")
+    few = (*few, *stranger.flags())
     start = tmp_path / "start.yaml"
     start.write_text("parameters:\n  motion.acceleration_density: [0.1, 0.1, 0.9]\n")
     out = tmp_path / "tuned"
