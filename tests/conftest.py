@@ -74,6 +74,10 @@ if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = " ".join(f"--{name}={value}" for name, value in flags.items())
 
 
+from tests.helpers import late  # noqa: E402  (it imports what the hooks see)
+
+late.listen()
+
 # A file is one worker's: what takes minutes must not come last.
 LONG = """test_navigator test_hypotheses test_replay test_faults test_tune test_following test_demo
     test_tuning_driving test_rollout test_study_kinds test_studies test_examples test_twist_pilot
@@ -97,6 +101,15 @@ def let_compiled_code_go() -> Iterator[None]:
     maps = Path("/proc/self/maps")
     if maps.exists() and len(maps.read_bytes().splitlines()) > 20_000:
         jax.clear_caches()
+        late.forget()
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_compiled_while_somebody_waits() -> Iterator[None]:
+    """See `tests/helpers/late.py`."""
+    yield
+    found = late.taken()
+    assert not found, "\n".join(found)
 
 
 @pytest.fixture(scope="session")

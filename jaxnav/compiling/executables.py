@@ -37,6 +37,7 @@ _WITHOUT = (
     "calibration", "commands", "datasets", "plots", "studies", "testing", "tuning", "viewer",
 )  # fmt: skip
 PACKAGE = Path(__file__).resolve().parents[1]
+ASKED = "/jaxnav/executables/asked"  # JAX's listeners hear of it as of a compilation
 
 _folders: list[Path] = []  # the last one counts
 
@@ -79,6 +80,7 @@ def program(
 
     Loaded if another process has kept it, else compiled and kept.
     """
+    jax.monitoring.record_event(ASKED)
     given, inputs = _asked(arguments)
     name = _file(_name(function, given), inputs)
     return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)

@@ -36,7 +36,7 @@ class AprilTagDetector:
             raise BadInput(
                 "detector", "'apriltag' needs pyapriltags: pip install 'jaxnav[apriltag]'"
             ) from error
-        self.family, self._ids = family, ids
+        self.family, self.ids = family, ids
         self._decoder = pyapriltags.Detector(families=family, nthreads=1, quad_decimate=1.0)
 
     def detect(
@@ -56,4 +56,4 @@ class AprilTagDetector:
             for tag in self._decoder.detect(np.ascontiguousarray(image))
             if tag.decision_margin > _MIN_DECISION_MARGIN
         ]
-        return refine_detections(image, markers, self.family, camera, self._ids)
+        return refine_detections(image, markers, self.family, camera, self.ids)

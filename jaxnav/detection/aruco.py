@@ -46,7 +46,7 @@ class ArucoDetector:
             closer_looks: most quadrilaterals of an image to look at again, some ms each.
         """
         self.family = family
-        self._ids = None if ids is None else frozenset(ids)
+        self.ids = None if ids is None else frozenset(ids)
         self._closer_looks = closer_looks
         self._decoders: dict[float, cv2.aruco.ArucoDetector] = {}
         self._decoder(0.0)
@@ -69,7 +69,7 @@ class ArucoDetector:
                         f for f in markers_there if not any(_overlap(f[1], c) for _, c in markers)
                     ]
                     unread = [quad, *unread_there, *unread]
-        if self._ids is not None and self._ids <= {marker_id for marker_id, _ in markers}:
+        if self.ids is not None and self.ids <= {marker_id for marker_id, _ in markers}:
             unread = []  # all that matter are read
         looked_at = [corners for _, corners in markers]
         for quad in frames_first(image, _worth_a_look(unread))[: self._closer_looks]:
@@ -79,7 +79,7 @@ class ArucoDetector:
             if read is not None:
                 markers.append((read[0], read[1].corners_px))
                 looked_at.append(read[1].corners_px)
-        return refine_detections(image, markers, self.family, camera, self._ids)
+        return refine_detections(image, markers, self.family, camera, self.ids)
 
     def detect_near(
         self,
@@ -105,7 +105,7 @@ class ArucoDetector:
                 if code is not None:
                     markers.append((code[0], code[1].corners_px))
                     break
-        return refine_detections(image, markers, self.family, camera, self._ids)
+        return refine_detections(image, markers, self.family, camera, self.ids)
 
     def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
         """The decoder whose least perimeter is this part of the image's longer side."""

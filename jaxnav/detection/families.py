@@ -4,7 +4,7 @@ from functools import cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from jaxnav.errors import BadInput
 from jaxnav.models.markers import FAMILY_SIZES, opencv_dictionary_name
@@ -42,6 +42,17 @@ def all_cells(family: str) -> Float[np.ndarray, "ids n n"]:
 def marker_cells(family: str, marker_id: int) -> Float[np.ndarray, "n n"]:
     """Cells of a marker with its black frame, (n, n) float: 1 white, 0 black, top row first."""
     return all_cells(family)[marker_id]
+
+
+def printed(
+    family: str, marker_id: int, cell_px: int
+) -> tuple[UInt8[np.ndarray, "side side"], Float[np.ndarray, "4 2"]]:
+    """A picture of a marker and its white zone, and where its corners are, TL TR BR BL."""
+    cells = np.pad(marker_cells(family, marker_id), 1, constant_values=1)
+    levels = np.where(cells == 1, 200, 30).astype(np.uint8)
+    low, high = cell_px - 0.5, cell_px * (len(cells) - 1) - 0.5
+    quad_px = np.array([[low, low], [high, low], [high, high], [low, high]])
+    return np.kron(levels, np.ones((cell_px, cell_px), np.uint8)), quad_px
 
 
 @cache

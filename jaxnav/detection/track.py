@@ -11,13 +11,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxnav.detection.disturbed_fit import fit_disturbed
-from jaxnav.detection.paper import SQUARE
+from jaxnav.detection.families import codes_of, marker_cells, printed
+from jaxnav.detection.lens import Lens
 from jaxnav.detection.patch_fit import MOST_STREAK_PX, PatchFit
-from jaxnav.detection.refine import mean_side_px
+from jaxnav.detection.refine import mean_side_px, refine_corners
 from jaxnav.detection.template import best_match
 from jaxnav.models.camera import Camera
 
@@ -30,6 +32,7 @@ _LEAST_EXPLAINED = 0.5
 _LEAST_ADVANTAGE = 70.0  # of white noise
 _MOST_MOVED = 0.25
 _MODEL_SIGMA_PX = 0.008
+_WARM_CELL_PX = 4  # with more pixels than a first fit takes: see `PatchFit.finer`
 _STREAK_SIGMA_PX = 0.5  # where the streak is as long as the marker's side
 
 
@@ -108,13 +111,36 @@ def track(
     return tracks
 
 
-def warm_up_tracks(camera: Camera | None, families: Sequence[str]) -> None:
-    """Compile what `track` calls, so that the first marker takes no longer than others."""
-    image = np.full((64, 64), 128, np.uint8)
-    for family in families:
-        fit = PatchFit.begin(image, camera, (family, 0), (32 + 12 * SQUARE), np.zeros(2), math.inf)
-        if fit is not None:
-            fit.again().finer()
+def warm_up_fits(camera: Camera | None, family: str, marker_id: int, tracks: bool) -> None:
+    """Compile or load all that detectors of a family call, whatever their images will show.
+
+    Which programs these are depends on the kind of lens, on how many cells a marker has, and for
+    `track` on the family. So what is fitted here is a marker that is always found: in the middle of
+    a lens of that kind, which bends nothing there.
+
+    Args:
+        camera: as in `Detector.detect`.
+        marker_id: of the family.
+        tracks: also what `track` calls.
+    """
+    image, quad_px = printed(family, marker_id, _WARM_CELL_PX)
+    if camera is not None:
+        side_px = np.full_like(np.asarray(camera.focal_px), len(image))
+        straight = np.zeros_like(np.asarray(camera.distortion))
+        camera = eqx.tree_at(
+            lambda one: (one.focal_px, one.center_px, one.distortion),
+            camera,
+            (side_px, side_px / 2, straight),
+        )
+    lens = Lens(camera)
+    refined = refine_corners(image, quad_px, marker_cells(family, marker_id), lens)
+    assert refined.fitted is not None  # else its programs would be missing in mid-drive
+    codes_of(family)  # as long as a fit
+    if tracks:
+        key = family, marker_id
+        fit = PatchFit.begin(image, camera, key, quad_px, np.zeros(2), math.inf)
+        assert fit is not None
+        fit.again().finer()
 
 
 def first_fit(image: np.ndarray, camera: Camera | None, target: Target) -> PatchFit | None:

@@ -80,6 +80,11 @@ class Detector(Protocol):
 
     family: str
 
+    @property
+    def ids(self) -> Collection[int] | None:
+        """Those of the markers whose corners matter; None: of all."""
+        ...
+
     def detect(
         self,
         image: UInt8[np.ndarray, "rows columns *channels"],

@@ -12,13 +12,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.detection.families import marker_cells
+from jaxnav.detection.families import marker_cells, printed
 from jaxnav.detection.signs_of_life import telling
-from jaxnav.detection.track import warm_up_tracks
+from jaxnav.detection.track import warm_up_fits
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
 from jaxnav.loop.flags import Fault
@@ -86,25 +85,39 @@ class Search:
         """
         self._camera, self._size_px, self._model = camera, size_px, model
         self._detectors, self.tracker = list(detectors), tracker
+        self._warm = False
         self._since_whole = camera  # so that cameras take turns
         self._picture, self._pictures = b"", 0  # the last picture, and how often it repeated
 
     def warm_up(self) -> None:
-        """Search a picture of a marker, so that the first frame takes no longer than others."""
-        width, height = self._size_px
-        image = np.full((height, width), 200, np.uint8)
-        side = max(min(16 * (min(width, height) // 32), 64), 1)
+        """Compile or load all that a frame may need, and search pictures of markers of the map.
+
+        So no frame takes longer than others, and none hangs: compilers give no sign of life. Once
+        is enough.
+        """
+        if self._warm:
+            return
         for detector in self._detectors:
-            printed = (255 * marker_cells(detector.family, 0)).astype(np.uint8)
-            # A picture that is too small for a marker shows only its upper left part.
-            picture = cv2.resize(printed, (side, side), interpolation=cv2.INTER_NEAREST)
-            image[8 : 8 + side, 8 : 8 + side] = picture[: height - 8, : width - 8]
-        corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        region = Region((8 + side * corner)[None], np.array([4.0]))
-        self._near(image, region)
-        self._everywhere(image, region)
-        if self.tracker is not None:
-            warm_up_tracks(self._model, sorted({one.family for one in self._detectors}))
+            marker_id = min(detector.ids or (0,))
+            warm_up_fits(self._model, detector.family, marker_id, self.tracker is not None)
+            # By another one: what is seen now is nobody's past.
+            twin = Search(self._camera, self._size_px, self._model, [detector])
+            image, quad_px = self._picture_of(detector.family, marker_id)
+            twin.look(Frame(0, image), None)
+            twin.look(Frame(1, image), Region(quad_px[None], np.array([4.0])))
+        self._warm = True
+
+    def _picture_of(self, family: str, marker_id: int) -> tuple[np.ndarray, np.ndarray]:
+        """A picture with a marker in its middle, or that part of it that it has room for, and the
+        marker's corners."""
+        width, height = self._size_px
+        image = np.full((height, width), 160, np.uint8)
+        cells = len(marker_cells(family, marker_id))
+        marker, quad_px = printed(family, marker_id, max(min(width, height, 128) // (cells + 2), 1))
+        marker = marker[:height, :width]
+        row, column = (height - len(marker)) // 2, (width - marker.shape[1]) // 2
+        image[row : row + len(marker), column : column + marker.shape[1]] = marker
+        return image, quad_px + np.array([column, row])
 
     def look(self, frame: Frame, region: Region | None) -> FrameDetections:
         """Search a frame for markers.
@@ -223,7 +236,8 @@ class Eyes:
 
     def start(self) -> None:
         """Start the threads."""
-        self._searches[0].warm_up()
+        for search in self._searches:
+            search.warm_up()
         for thread in self._threads:
             thread.start()
 

@@ -59,6 +59,7 @@ def drive(
         delays: estimates the cameras' delays; None: not estimated.
         happens: changes the world; called with the time before each input is made.
     """
+    pilot.warm_up()  # as before every drive
     rates = rates or Rates()
     end_ns = BEGIN_NS + int(duration_s * 1e9)
     waiting: list[tuple[int, int, Input]] = []

@@ -22,7 +22,7 @@ from jaxnav.detection.paper import homography
 from jaxnav.detection.pattern_program import follow_pattern
 from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.template import best_match
-from jaxnav.detection.track import warm_up_tracks
+from jaxnav.detection.track import warm_up_fits
 from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import random_scene
 from tests.helpers.other_pictures import RASTER, other_pictures
@@ -181,7 +181,7 @@ def test_a_drive_compiles_at_its_start_what_disturbed_markers_need(monkeypatch):
         track(image, truth.camera, [target(truth, 0)])
     needed = frozenset(kinds)
     kinds.clear()
-    warm_up_tracks(truth.camera, [FAMILY])
+    warm_up_fits(truth.camera, FAMILY, 0, tracks=True)
     assert needed <= kinds
 
 

@@ -5,8 +5,6 @@ import math
 import threading
 import time
 
-import cv2
-import jax
 import numpy as np
 import pytest
 
@@ -442,33 +440,6 @@ def test_where_it_is_expected_is_where_it_is_looked_for_first(near, region, aske
         sighted = search.look(Frame(number, picture), regions.get(region))
         assert sighted.detections is not None
     assert finder.asked == asked
-
-
-def test_a_warm_search_compiles_nothing_whatever_there_is_to_see(data_dir, caplog):
-    """A program that is compiled in a watched thread takes longer than the guard allows."""
-    rig = jax.device_get(worlds.qcar_rig())
-    width, height = rig.image_sizes_px[0]
-    search = Search(
-        0, (width, height), rig.camera(0), [make_detector("aruco", "tag36h11")], Tracker()
-    )
-    search.warm_up()
-    found = 0
-    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
-        for path in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
-            photo = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            for scale in (1.0, 1.6):
-                image = cv2.resize(photo, (round(width * scale), round(width * scale * 2 / 3)))
-                image = np.ascontiguousarray(image[:height, :width])
-                found += len(search.look(Frame(0, image), None).detections)
-        assert found > 30
-        image, truth = other_pictures("blur4")[0]
-        image = cv2.copyMakeBorder(
-            image, 0, height - len(image), 0, width - image.shape[1], cv2.BORDER_REPLICATE
-        )
-        keys = ((truth.family, truth.id),)
-        search.look(Frame(1, image), Region(truth.corners_px[None], np.array([4.0]), keys))
-    compiled = [one.getMessage() for one in caplog.records if "XLA compilation" in one.getMessage()]
-    assert not compiled
 
 
 class TurningCar(Car):

@@ -8,9 +8,11 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from tests.helpers.late import MAIN
+
 ROOT = Path(__file__).parents[2]
 ENDED_S = 5.0  # what a program's guard has to do is done by then
-JAXNAV = (sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())")
+JAXNAV = (sys.executable, "-c", MAIN)
 
 
 class Program:

@@ -41,6 +41,10 @@ class DelayWatch:
         self._thread = threading.Thread(target=self._run, name="jaxnav-delays", daemon=True)
         self._thread.start()
 
+    def warm_up(self) -> None:
+        """Compile or load what it calls, before the drive."""
+        self._delays.warm_up()
+
     @property
     def faults(self) -> Fault:
         """See `Observer`."""
@@ -67,7 +71,6 @@ class DelayWatch:
         return "\n".join(warnings(self._delays, self._setup)) or None if self._faults else None
 
     def _run(self) -> None:
-        self._delays.warm_up()
         while not self._closing:
             self._wake.wait()
             self._wake.clear()

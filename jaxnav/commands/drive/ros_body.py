@@ -74,7 +74,9 @@ class PreparedBody:
         self._searches = searches_for(args.corner_backend, rig, markers)
         connection.ros_time = True  # the same stamps give the same poses, whenever they come
         self._step = compiled_step(self._navigator, step_folder())
-        timed(say, self._tracker(lambda report: None).warm_up)
+        tracker = self._tracker(lambda report: None)
+        others = [search.warm_up for search in self._searches]
+        timed(say, lambda: [warm_up() for warm_up in (tracker.warm_up, *others)])
         odom, listening = odom_for(file, connection)
         self._leave = partial(connection.forget, *listening)
         self._publisher = publisher_for(file, connection, markers, odom)

@@ -92,7 +92,9 @@ class PreparedDrive:
         self._searches = searches_for(
             args.corner_backend, setup.rig, setup.markers, args.detector == "follow"
         )
-        timed(say, lambda: compiled_pilot(self._run, setup, self._searches))
+        others = [search.warm_up for search in self._searches]
+        others.append(LearntKeeper(file, setup).warm_up)
+        timed(say, lambda: compiled_pilot(self._run, setup, others))
         odom: OdomFrame | None = None
         self._listening: list[Any] = []
         self._inputs: Sequence[Input] | None = None

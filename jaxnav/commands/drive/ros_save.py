@@ -1,10 +1,13 @@
 """Write what the node has learnt of cameras and sensors into new files, while it drives."""
 
+from contextlib import suppress
 from importlib.metadata import version
 
 import jax
 import numpy as np
 
+from jaxnav.belief.camera_errors import EACH
+from jaxnav.belief.sensor_errors import LEARNT, SENSORS_END
 from jaxnav.commands.drive.ros_setup import path_of
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig, load_vehicle
@@ -71,6 +74,22 @@ class LearntKeeper:
             raise BadInput(_WHERE, NEVER_SURE)
         if not folder or not target.is_dir():
             raise BadInput(_WHERE, f"there is no folder {target if folder else repr(folder)}")
+        learnt, texts = self._adopted(known)
+        for name in texts:
+            if (target / name).exists():
+                raise BadInput(target / name, "is there already: nothing is written over")
+        atomic_write_all({target / name: text for name, text in texts.items()})
+        found = learnt.sentences() or ["nothing is off by three of its sigmas"]
+        return f"{', '.join(texts)} in {target}: {'; '.join(found)}"
+
+    def warm_up(self) -> None:
+        """Compile what `save` calls: some twenty operations, while others drive."""
+        count = SENSORS_END - LEARNT + EACH * len(self._setup.rig)
+        with suppress(BadInput):  # said by who saves
+            self._adopted((np.zeros(count), np.ones(count)))
+
+    def _adopted(self, known: tuple[np.ndarray, np.ndarray]) -> tuple[Learnt, dict[str, str]]:
+        """What has been learnt, and the new files by their names."""
         rig_path, vehicle_path = path_of(self._file, "rig"), path_of(self._file, "vehicle")
         setup = self._setup
         with jax.enable_x64(True):
@@ -83,10 +102,4 @@ class LearntKeeper:
             if is_other_vehicle(vehicle, as_car(setup.vehicle, vehicle_path)):
                 raise BadInput(vehicle_path, "has other corrections by now than those driven with")
             calibrated = calibrated_now(f"jaxnav {version('jaxnav')} ros, ~/save", known)
-            texts = adopted_files(setup, learnt, calibrated, rig, vehicle)
-        for name in texts:
-            if (target / name).exists():
-                raise BadInput(target / name, "is there already: nothing is written over")
-        atomic_write_all({target / name: text for name, text in texts.items()})
-        found = learnt.sentences() or ["nothing is off by three of its sigmas"]
-        return f"{', '.join(texts)} in {target}: {'; '.join(found)}"
+            return learnt, adopted_files(setup, learnt, calibrated, rig, vehicle)

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
+from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.learnt_watch import ExposureWatch
 from jaxnav.commands.drive.observers import open_onlookers
 from jaxnav.commands.kinds import key_values
@@ -78,7 +79,9 @@ def run(args: Run, signals: Signals) -> int:
         for onlooker in onlookers:
             signals.before_leaving(onlooker.close)
         signals.check()
-        pilot = compiled_pilot(args, setup, searches)
+        others = [search.warm_up for search in searches]
+        others += [one.warm_up for one in onlookers if isinstance(one, DelayWatch)]
+        pilot = compiled_pilot(args, setup, others)
         signals.check()
         drive = Drive(args, vehicle_setup, guarding, signals)
         reason = drive.run(pilot, searches, onlookers)
@@ -150,15 +153,23 @@ def searches_for(
     ]
 
 
-def compiled_pilot(args: Run, setup: DriveSetup, searches: Sequence[Search]) -> Pilot:
-    """A pilot and searches that are compiled and warmed up; returns the pilot."""
+def compiled_pilot(
+    args: Run, setup: DriveSetup, others: Sequence[Callable[[], None]] = ()
+) -> Pilot:
+    """A pilot that is compiled and warmed up.
+
+    Args:
+        others: compile what else a drive calls. Once it is armed nothing is compiled or loaded any
+            more: whoever waits for it hangs in the eyes of the guard.
+    """
     _say(args, "compiling")
     began_s = time.monotonic()
     with ThreadPoolExecutor(1) as beside:
-        looked = beside.submit(searches[0].warm_up)
+        warm = [beside.submit(other) for other in others]  # in turns: they share programs
         pilot = setup.pilot(step_folder())
         pilot.warm_up()
-        looked.result()
+        for other in warm:
+            other.result()
     _say(args, f"compiled in {time.monotonic() - began_s:.1f} s")
     return pilot
 

@@ -13,6 +13,7 @@ from jaxnav.files.ros import load_ros
 from jaxnav.loop.pilot import Input
 from jaxnav.recording.drive_setup import DriveSetup
 from tests.commands.calibrate.test_adopt import adopt, learnt_outcome, record, setup_of
+from tests.helpers import late
 
 NAMES = ("rig", "vehicle")
 NODE = """\
@@ -60,7 +61,10 @@ def keeper_of(folder, outcomes, setup: DriveSetup | None = None) -> LearntKeeper
 
 def test_it_writes_what_adopt_makes_of_the_recording(folder):
     outcomes = [learnt_outcome(index, decided=index < 10) for index in range(12)]
-    said = keeper_of(folder, outcomes).save("new")
+    keeper = keeper_of(folder, outcomes)
+    keeper.warm_up()
+    with late.watching():  # the node drives meanwhile
+        said = keeper.save("new")
     assert said.startswith(f"rig.yaml, vehicle.yaml in {folder / 'new'}: camera ")
     assert "looks 1.20 deg too far left" in said
     recording = record(folder / "drive.mcap", outcomes)

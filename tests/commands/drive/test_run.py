@@ -23,10 +23,10 @@ from jaxnav.recording.drive_log import read_drive
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle
+from tests.helpers.late import MAIN
 from tests.helpers.recorded_vehicle import Word, words
 
 ROOT = Path(__file__).resolve().parents[3]
-MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 STOPS_S = 0.2  # after a signal, at the latest
 SLACK_S = 0.3  # of a machine that does something else
 START_S = 120.0  # until it drives: the first one compiles, on a machine that is busy
@@ -168,6 +168,33 @@ def assert_arrived(ended: Ended) -> None:
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith("ended: arrived\n")
     assert ended.told[-1].throttle == 0
+
+
+@pytest.mark.parametrize(("family", "marker_id"), [("tag36h11", 5), ("4x4_50", 17)])
+def test_images_of_any_map_end_no_drive(workplace, tmp_path, family, marker_id):
+    """Programs that are made or loaded in a watched thread would."""
+    markers = (ROOT / "calib/qcar/markers.yaml").read_text()
+    markers = markers.replace("id: 0", f"id: {marker_id}").replace("tag36h11", family)
+    (tmp_path / "markers.yaml").write_text(markers)
+    ended = subprocess.run(
+        workplace.command(
+            *("--markers", tmp_path / "markers.yaml", "--option", "images=true"),
+            *("--record", tmp_path / "drive.mcap", "--duration-s", 3, "--headless"),
+            *("--timeout-s", 3),
+        ),
+        env=workplace.environment(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "ended: time is over" in ended.stdout
+    drive = read_drive(tmp_path / "drive.mcap")
+    seen = [one for given in drive.inputs for one in given.frames if one.detections]
+    assert {(one.detections.families[0], int(one.detections.ids[0])) for one in seen} == {
+        (family, marker_id)
+    }
 
 
 def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):

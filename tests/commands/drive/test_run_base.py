@@ -12,9 +12,9 @@ import pytest
 from jaxnav.loop.flags import Fault, Health
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.recording.drive_setup import DriveSetup
+from tests.helpers.late import MAIN
 
 ROOT = Path(__file__).resolve().parents[3]
-MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 BASE = """
 base: differential
 forward_limit_mps: 1.0
