@@ -85,6 +85,11 @@ class Detector(Protocol):
     family: str
     ids: Collection[int] | None
 
+    @property
+    def ids(self) -> Collection[int] | None:
+        """Those of the markers whose corners matter; None: of all."""
+        ...
+
     def detect(
         self,
         image: UInt8[np.ndarray, "rows columns *channels"],

@@ -87,8 +87,9 @@ def run(args: Run, signals: Signals) -> int:
         for onlooker in onlookers:
             signals.before_leaving(onlooker.close)
         signals.check()
-        watches = [one for one in onlookers if isinstance(one, DelayWatch)]
-        pilot = compiled_pilot(args, setup, [one.warm_up for one in (*searches, *watches)])
+        others = [search.warm_up for search in searches]
+        others += [one.warm_up for one in onlookers if isinstance(one, DelayWatch)]
+        pilot = compiled_pilot(args, setup, others)
         signals.check()
         resumes = args.vehicle is not None and may_resume(args.vehicle)
         drive = Drive(args, vehicle_setup, guarding, signals, resumes=resumes)

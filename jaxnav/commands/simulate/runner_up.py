@@ -29,6 +29,8 @@ class OpenCVDetector:
     Of its ways to refine corners it has the one that errs least in these images, subpixel.
     """
 
+    ids = None  # all of them
+
     def __init__(self, family: str):
         """See `make_detector`."""
         self.family = family
