@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from jaxnav.files.ranges import RANGES
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import GyroReading
 from jaxnav.loop.stamps import Stamps
@@ -22,6 +23,7 @@ from jaxnav.loop.stamps import Stamps
 # Readings farther apart leave a hole; so long the newest one holds. A turn may begin meanwhile: at
 # 5 rad/s^2 it is 6 mrad.
 GAP_NS = 50_000_000
+_MOST_RADPS = RANGES["turn_radps"].most
 _KEPT_NS = 1_500_000_000  # more than the age of the oldest event that is fused, see `stamps`
 STUCK_AFTER = 25  # readings to the last bit alike, other than zero: a sensor's noise is never so
 
@@ -89,11 +91,12 @@ class GyroTrack:
         return faults
 
     def _is_rate(self, turn_radps: float) -> bool:
-        """Whether a reading is a rate: finite, below the limit, and not stuck."""
+        """Whether a reading is a rate: one that can be, below the limit, and not stuck."""
         alike = turn_radps == self._raw_radps and turn_radps != 0
         self._alike = self._alike + 1 if alike else 0
         self._raw_radps = turn_radps
-        return abs(turn_radps) < self._saturation_radps and self._alike < STUCK_AFTER
+        is_within = abs(turn_radps) < min(self._saturation_radps, _MOST_RADPS)
+        return is_within and self._alike < STUCK_AFTER
 
     def _at(self, stamp_ns: int) -> _Sample | None:
         """The track at a time, interpolated, or held after its newest reading; None: not known."""
