@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.learnt_watch import ExposureWatch
-from jaxnav.commands.drive.observers import open_onlookers
+from jaxnav.commands.drive.observers import closing_notes, open_onlookers
 from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
@@ -84,9 +84,8 @@ def run(args: Run, signals: Signals) -> int:
         reason = drive.run(pilot, searches, onlookers)
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
-    for onlooker in onlookers:
-        if onlooker.closing_note is not None:
-            print(onlooker.closing_note)
+    for note in closing_notes(onlookers, drive.loop.contained):
+        print(note)
     if drive.unheard is not None:
         print(f"THE VEHICLE HAS NOT HEARD THAT IT MUST STOP: {drive.unheard}")
     return EXIT_STOPPED if drive.loop.stopped or drive.unheard is not None else 0
