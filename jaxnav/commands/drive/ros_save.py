@@ -1,5 +1,6 @@
 """Write what the node has learnt of cameras and sensors into new files, while it drives."""
 
+from contextlib import suppress
 from importlib.metadata import version
 
 import jax
@@ -69,7 +70,10 @@ class LearntKeeper:
         known, target = self._known, self._file.path.parent / folder
         if known is None:
             raise BadInput(_WHERE, NEVER_SURE)
-        if not folder or not target.is_dir():
+        is_there = False
+        with suppress(OSError):  # a name that is too long, say
+            is_there = bool(folder) and target.is_dir()
+        if not is_there:
             raise BadInput(_WHERE, f"there is no folder {target if folder else repr(folder)}")
         rig_path, vehicle_path = path_of(self._file, "rig"), path_of(self._file, "vehicle")
         setup = self._setup
