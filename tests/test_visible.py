@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from jaxnav.calibration.boards.images import source_files
 from jaxnav.cli import main, nothing_hidden
 from jaxnav.commands.pictures import save_figure
-from jaxnav.errors import BadInput, visible
+from jaxnav.errors import BadInput, Containment, visible
 from jaxnav.files.images import decode_image
 from jaxnav.vehicles.opencv_cameras import _device
 from tests.helpers.seed_texts import OPENCV
@@ -105,3 +105,39 @@ def test_a_library_adds_no_line_to_ours(tmp_path, capfd):
         assert capfd.readouterr().err.count("\n") <= 1
         assert main(["calibrate", "intrinsics", str(path), "--board", str(path)]) == 2
         assert capfd.readouterr().err.count("\n") == 1
+
+
+def test_what_raises_is_named_counted_said_once_a_minute_and_ends_nothing(monkeypatch):
+    now_s, said = [100.0], []
+    monkeypatch.setattr("jaxnav.errors.time.monotonic", lambda: now_s[0])
+    contained = Containment(said.append)
+
+    def divide(a, b):
+        return a / b
+
+    for _ in range(3):
+        assert contained.of("/odom", divide, lambda problem, a, b: (problem, a))(1, 0) == (
+            "/odom: ZeroDivisionError: division by zero",
+            1,
+        )
+    assert contained.of("/odom", divide)(1, 2) == 0.5
+    now_s[0] += 61.0
+    assert contained.of("/odom", divide)(1, 0) is None
+    problem = "/odom: ZeroDivisionError: division by zero"
+    assert said == [problem, f"{problem} (4 times so far)"]
+    assert contained.summary() == "raised, and were left out: /odom 4"
+
+
+def test_nor_does_what_is_done_about_it(capsys):
+    """What is done instead may raise, and so may whoever is told; nothing that is said is long."""
+
+    def fails(*arguments):
+        raise ValueError("x" * 100_000 + "\x1b[31m")
+
+    assert Containment().of("a", fails, fails)() is None
+    (line,) = capsys.readouterr().err.splitlines()
+    assert len(line) < 1100
+    assert "\x1b" not in line
+    contained = Containment(fails)
+    assert contained.of("a", fails, fails)() is None
+    assert contained.counts == {"a": 2}

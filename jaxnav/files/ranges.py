@@ -99,6 +99,7 @@ RANGES: dict[str, Range] = {
     "seen_sigma_px": Range(1e-6, 1e3, "px", "standard deviation of a corner seen", LEFT_OUT),
     "speed_mps": Range(-1e3, 1e3, "m/s", "speed read", LEFT_OUT),
     "steering_rad": Range(-63.0, 63.0, "rad", "steering angle read", LEFT_OUT),
+    "turn_radps": Range(-1e3, 1e3, "rad/s", "turn rate read", LEFT_OUT),
     "pose": Range(-1e9, 1e9, "m, rad", "pose that a pilot reported", LEFT_OUT),
     "reported": Range(
         -math.inf, math.inf, "", "probability, covariance, cost that a pilot reported", CARRIED

@@ -24,6 +24,7 @@ base_x_m: -0.128               # of base_link, forward of the middle between the
 tf_tolerance_s: 0.0            # tf is stamped so far in the future
 """
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -122,7 +123,10 @@ class RosFile(TopicMap):
         if text is None:
             return None
         path = self.path.parent / text
-        if not path.is_file():
+        is_there = False
+        with suppress(OSError):  # a name that is too long, say
+            is_there = path.is_file()
+        if not is_there:
             raise BadInput(at(self.path, key), f"there is no file {path}")
         return path
 

@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.files.ranges import RANGES
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import Odometry, Reading, TwistOdometry
 from jaxnav.loop.limits import Command, Limits, TwistLimits, turns_by_twist
@@ -28,6 +29,9 @@ from jaxnav.models.twist_base import TwistBase
 
 # A rim is not farther from the middle than this: a slow turn limit says nothing of the size.
 _WIDEST_M = 0.5
+# Of `values` of a reading, the names in the table of ranges.
+_CAR_READS = "speed_mps", "steering_rad"
+_BASE_READS = "speed_mps", "speed_mps", "turn_radps"
 
 # How exactly a command is followed, see `Part`. The throttle as in `propulsion`; what is commanded
 # in m/s, rad/s or rad is regulated, or a servo's.
@@ -95,7 +99,7 @@ class Chassis(Protocol):
     def slides_m(self) -> float: ...
 
     def reads(self, reading: Reading) -> bool:
-        """Whether a reading is of this kind of vehicle, and finite."""
+        """Whether a reading is of this kind of vehicle, and one that a vehicle can have."""
         ...
 
     def motion(self, reading: Reading) -> Motion:
@@ -170,7 +174,7 @@ class CarChassis:
 
     def reads(self, reading: Reading) -> bool:
         """See `Chassis`."""
-        return isinstance(reading, Odometry) and all(map(math.isfinite, reading.values))
+        return isinstance(reading, Odometry) and _can_be(_CAR_READS, reading.values)
 
     def motion(self, reading: Reading) -> Motion:
         """See `Chassis`; Eqs. 4 to 7 of the paper, as `bicycle.velocity_world`."""
@@ -249,7 +253,7 @@ class BaseChassis:
 
     def reads(self, reading: Reading) -> bool:
         """See `Chassis`."""
-        return isinstance(reading, TwistOdometry) and all(map(math.isfinite, reading.values))
+        return isinstance(reading, TwistOdometry) and _can_be(_BASE_READS, reading.values)
 
     def motion(self, reading: Reading) -> Motion:
         """See `Chassis`."""
@@ -308,6 +312,11 @@ class BaseChassis:
 def chassis_of(vehicle: Vehicle | TwistBase) -> CarChassis | BaseChassis:
     """That of a vehicle's description."""
     return BaseChassis.of(vehicle) if turns_by_twist(vehicle) else CarChassis.of(vehicle)
+
+
+def _can_be(names: tuple[str, ...], values: tuple[float, ...]) -> bool:
+    """Whether each value is within the range of its name."""
+    return all(RANGES[name].holds(value) for name, value in zip(names, values, strict=True))
 
 
 def car_motion(speed_mps: float, steering_rad: float, wheelbase_m: float) -> Motion:

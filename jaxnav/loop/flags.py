@@ -17,7 +17,7 @@ class Fault(enum.IntFlag):
     STAMP_INVALID = enum.auto()  # repeated, in the future, too old, zero or negative
     CLOCK_JUMPED = enum.auto()  # the clock of a source has jumped, or the loop itself slept
     ODOMETRY_STALE = enum.auto()
-    ODOMETRY_INVALID = enum.auto()  # the driver says so, or a value is not finite
+    ODOMETRY_INVALID = enum.auto()  # the driver says so, or a value is none that a vehicle can have
     ODOMETRY_STUCK = enum.auto()  # repeated values while the car moves, or corners move at rest
     NO_MARKER = enum.auto()  # for a second
     UNSURE = enum.auto()  # position sigma beyond its limit
@@ -28,7 +28,7 @@ class Fault(enum.IntFlag):
     VEHICLE_FAILED = enum.auto()  # it could not be read or written
     DEADLINE_MISSED = enum.auto()  # a cycle took longer than its period
     RECORDER_BEHIND = enum.auto()  # messages were left out
-    RECORDER_FAILED = enum.auto()  # disk full, or the file is gone
+    RECORDER_FAILED = enum.auto()  # disk full, the file is gone, or another observer has raised
     NOTHING_MOVES = enum.auto()  # the throttle pulls, and neither wheels nor any corner move
     RESTARTED_OFTEN = enum.auto()  # too many restarts in a short time
     RELOCATED = enum.auto()  # the corners give a pose that no wheel slip explains
@@ -39,7 +39,7 @@ class Fault(enum.IntFlag):
     CAMERA_OUTVOTED = enum.auto()  # it does not see markers where another does
     # The estimate goes on without the gyro, and health stays as it is.
     GYRO_STALE = enum.auto()  # its file says that there is one, and it gave no rate in time
-    GYRO_INVALID = enum.auto()  # a reading is not finite, at the gyro's limit, or repeats itself
+    GYRO_INVALID = enum.auto()  # a reading is no rate, at the gyro's limit, or repeats itself
     GYRO_CONTRADICTED = enum.auto()  # by the two others that tell the turn: it is left out
     # What follows a command is not what was commanded: of the throttle or of ahead, of the left,
     # and of the steering or of the turn.

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from jaxnav.detection.observe import CornerLanes, observe
 from jaxnav.detection.types import Detections
-from jaxnav.files.ranges import RANGES
+from jaxnav.files.ranges import is_within
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.history import EventData
 from jaxnav.loop.stamps import Stamps
@@ -16,7 +16,6 @@ from jaxnav.models.markers import MarkerMap
 
 FROZEN_AFTER = 3  # frames in a row with exactly the same corners or picture
 _NO_FAULT = Fault(0)
-_MOST_PX = RANGES["corner_px"].most  # beyond, a corner is as good as infinite
 _NONE = Detections.concatenate([])
 
 # Whether a camera shows an old picture. Arguments: camera, stamp_ns, now_ns, corners_px, visible,
@@ -102,11 +101,8 @@ class FrameIntake:
             faults |= Fault.DUPLICATE_MARKER
         if seen.mirrored:
             faults |= Fault.CORNERS_MIRRORED
-        if not _are_finite(seen.corners_px, seen.sigma_px):
+        if hide_nowhere(seen):
             faults |= Fault.CORNERS_NOT_FINITE
-            for lane in zip(*np.nonzero(seen.visible), strict=True):
-                if not _are_finite(seen.corners_px[lane], seen.sigma_px[lane]):
-                    _hide(seen, lane)
         taken_ns, frozen_seen = self._leave_out_frozen(seen, stamps_ns, now_ns, frozen)
         if frozen_seen:
             faults |= Fault.FRAME_FROZEN
@@ -143,10 +139,20 @@ class FrameIntake:
         return times >= FROZEN_AFTER
 
 
-def _are_finite(corners_px: np.ndarray, sigma_px: np.ndarray) -> bool:
-    """Whether corners and sigmas are finite and in range; NaN fails every comparison."""
-    near = np.abs(corners_px).max() <= _MOST_PX
-    return bool(near and sigma_px.min() > 0 and sigma_px.max() < np.inf)
+def hide_nowhere(seen: CornerLanes) -> bool:
+    """Hide markers whose corners or sigmas are out of range; return whether there are any."""
+    if _are_within(seen.corners_px, seen.sigma_px):
+        return False
+    for lane in zip(*np.nonzero(seen.visible), strict=True):
+        if not _are_within(seen.corners_px[lane], seen.sigma_px[lane]):
+            _hide(seen, lane)
+    return True
+
+
+def _are_within(corners_px: np.ndarray, sigma_px: np.ndarray) -> bool:
+    """Whether corners and sigmas are in range; NaN and infinities are not."""
+    near = is_within("corner_px", corners_px).all()
+    return bool(near and is_within("seen_sigma_px", sigma_px).all())
 
 
 def _hide(seen: CornerLanes, lane: tuple[int, ...]) -> None:

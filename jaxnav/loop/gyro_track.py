@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from jaxnav.files.ranges import RANGES
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.interfaces import GyroReading
 from jaxnav.loop.stamps import Stamps
@@ -22,11 +23,12 @@ from jaxnav.loop.stamps import Stamps
 # Readings farther apart leave a hole; so long the newest one holds. A turn may begin meanwhile: at
 # 5 rad/s^2 it is 6 mrad.
 GAP_NS = 50_000_000
+_MOST_RADPS = RANGES["turn_radps"].most
 _KEPT_NS = 1_500_000_000  # more than the age of the oldest event that is fused, see `stamps`
 STUCK_AFTER = 25  # readings to the last bit alike, other than zero: a sensor's noise is never so
 # White noise of as many, which a sensor of cars has fifty times less of, and the most that a single
 # reading counts for: one that is odd is not yet noise.
-_NOISE_RADPS, _MOST_RADPS = 0.3, 1.5
+_NOISE_RADPS, _MOST_BEND_RADPS = 0.3, 1.5
 
 
 class _Sample(NamedTuple):
@@ -93,18 +95,19 @@ class GyroTrack:
         return faults
 
     def _is_rate(self, turn_radps: float) -> bool:
-        """Whether a reading is a rate: finite, below the limit, and not stuck."""
+        """Whether a reading is a rate: one that can be, below the limit, and not stuck."""
         alike = turn_radps == self._raw_radps and turn_radps != 0
         self._alike = self._alike + 1 if alike else 0
         # (1, -2, 1) of white noise of sigma s has the variance 6 s^2.
         bend_radps = (turn_radps - 2 * self._raw_radps + self._before_radps) / math.sqrt(6)
         if math.isfinite(bend_radps):
-            bend_radps = min(abs(bend_radps), _MOST_RADPS)
+            bend_radps = min(abs(bend_radps), _MOST_BEND_RADPS)
             self._noise_rad2ps2 += (bend_radps**2 - self._noise_rad2ps2) / STUCK_AFTER
         self._raw_radps, self._before_radps = turn_radps, self._raw_radps
         is_smooth = self._noise_rad2ps2 < _NOISE_RADPS**2
         is_alive = self._alike < STUCK_AFTER
-        return abs(turn_radps) < self._saturation_radps and is_alive and is_smooth
+        is_within = abs(turn_radps) < min(self._saturation_radps, _MOST_RADPS)
+        return is_within and is_alive and is_smooth
 
     def _at(self, stamp_ns: int) -> _Sample | None:
         """The track at a time, interpolated, or held after its newest reading; None: not known."""

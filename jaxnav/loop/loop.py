@@ -12,11 +12,12 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxnav.errors import Containment
 from jaxnav.loop.expectation import Expectation
 from jaxnav.loop.flags import Fault, Health
 from jaxnav.loop.frames import FrameDetections
@@ -41,7 +42,8 @@ _WELL_S = 2.0  # of health OK without a break, before a vehicle that the guard h
 
 
 class Observer(Protocol):
-    """An observer of the loop: a recorder, a view, a status line. It neither waits nor raises."""
+    """An observer of the loop: a recorder, a view, a status line. It does not wait. What it raises
+    is contained, see `Fenced`."""
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """Take an input that the pilot has handled, and its outcome."""
@@ -55,6 +57,31 @@ class Observer(Protocol):
     def faults(self) -> Fault:
         """The faults of the observer."""
         ...
+
+
+class Fenced:
+    """An observer whose exceptions reach nobody: they are said, counted, and a fault. Implements
+    `Observer`."""
+
+    def __init__(self, observer: Observer, contained: Containment):
+        def fence(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+            return contained.of(f"{type(observer).__name__}.{name}", function, self._failed)
+
+        self.on_outcome = fence("on_outcome", observer.on_outcome)
+        self.on_frame = fence("on_frame", observer.on_frame)
+        self._faults = fence("faults", lambda: observer.faults)
+        self._raised = Fault(0)
+
+    @property
+    def faults(self) -> Fault:
+        """Those of the observer, and whether it has raised since the last call."""
+        faults = self._faults() | self._raised
+        self._raised = Fault(0)
+        return faults
+
+    def _failed(self, problem: str, *arguments: Any) -> Fault:
+        self._raised = Fault.RECORDER_FAILED
+        return self._raised
 
 
 @dataclass
@@ -89,6 +116,7 @@ class Loop:
     Attributes:
         stopped: whether the guard ended the drive.
         late: whether it did because something did not come in time.
+        contained: what observers have raised.
     """
 
     def __init__(
@@ -111,9 +139,11 @@ class Loop:
         """
         self.pilot, self.guard, self.statistics = pilot, guard, Statistics()
         self.stopped = self.late = False
+        self.contained = Containment()
         self._say, self._held = say, False
         self._well_ns: int | None = None  # since when all is well, of a vehicle that is held
-        self._vehicle, self._eyes, self._observers = vehicle, eyes, list(observers)
+        self._vehicle, self._eyes = vehicle, eyes
+        self._observers = [Fenced(observer, self.contained) for observer in observers]
         self._period_ns = int(period_s * 1e9)
         self._now_ns, self._clock = now_ns, StandingClock()
         self._outcome: Outcome | None = None

@@ -20,6 +20,7 @@ from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.track import warm_up_fits
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
+from jaxnav.files.ranges import RANGES
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FROZEN_AFTER, FrameDetections
 from jaxnav.loop.guard import Guard
@@ -166,7 +167,8 @@ class Search:
         """The detections, and the expected markers that were followed without being decoded."""
         if self.tracker is None or not region.keys or frame.image is None:
             return detections
-        self.tracker.tell(frame.exposure_s, frame.row_time_s)
+        row_time_s = _told("row_time_s", frame.row_time_s)
+        self.tracker.tell(_told("exposure_s", frame.exposure_s), row_time_s)
         ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
             frame.image,
@@ -185,6 +187,11 @@ class Search:
         return Detections.concatenate(
             [detector.detect(image, self._model, quads_px) for detector in self._detectors]
         )
+
+
+def _told(name: str, value: float | None) -> float | None:
+    """A time that a driver tells; None where no camera can have it. A short exposure may be 0."""
+    return value if value is not None and 0 <= value <= RANGES[name].most else None
 
 
 def image_fault(image: np.ndarray | None, size_px: tuple[int, int]) -> Fault:

@@ -43,7 +43,7 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.vehicles import VehicleFile, as_car, is_base_file, vehicle_data
-from jaxnav.loop.estimator import advance_packed
+from jaxnav.loop.estimator import Program, advance_packed
 from jaxnav.loop.health import Timeouts
 from jaxnav.loop.pilot import Pilot
 from jaxnav.models.bicycle import Vehicle
@@ -151,6 +151,8 @@ class DriveSetup:
     parameters: dict[str, Any] = field(default_factory=dict)
     relocate: bool = True
     drives: bool = True
+    # By their folder. Each takes over 100 MB once it is loaded, and goes with the setup.
+    _programs: dict[Path | None, Program] = field(default_factory=dict, init=False, repr=False)
 
     def with_params(self, params: Params) -> "DriveSetup":
         """The setup with these parameters in place of all that it had.
@@ -197,17 +199,18 @@ class DriveSetup:
         return apply_params(navigator, Params.of(self.parameters, Path("DriveSetup")))
 
     def pilot(self, folder: Path | None) -> Pilot:
-        """A pilot at the beginning of a drive.
+        """A pilot at the beginning of a drive. All pilots of a setup share one compiled program.
 
         Args:
             folder: folder of executables, see `compile_or_load`.
         """
         navigator = self.navigator()
-        program = compile_or_load(advance_packed, navigator, folder)
+        if folder not in self._programs:
+            self._programs[folder] = compile_or_load(advance_packed, navigator, folder)
         return Pilot(
             navigator,
             self.timeouts,
-            program,
+            self._programs[folder],
             self.corner_sigma_px,
             self.relocate,
             self.drives,

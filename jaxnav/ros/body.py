@@ -14,10 +14,12 @@ import numpy as np
 
 from jaxnav.detection.observe import observe
 from jaxnav.detection.types import Detections
+from jaxnav.errors import Containment
+from jaxnav.loop.frames import hide_nowhere
 from jaxnav.navigator import Navigator, Step
 from jaxnav.pose.observation import Observation
 from jaxnav.ros.estimates import Report, report_of_body
-from jaxnav.ros.odometry_track import GrowingTrack
+from jaxnav.ros.odometry_track import SET_BACK_AFTER, SET_BACK_NS, GrowingTrack
 
 MAX_DT_S = 1.0  # over a longer pause the motion is predicted for one second
 _PATIENCE_S = 0.1  # an observation waits so long for its other cameras and the odometry
@@ -38,12 +40,14 @@ class BodyTracker:
         cameras: int,
         tell: Callable[[Report], None],
         odometry: GrowingTrack | None = None,
+        contained: Containment | None = None,
     ):
         """Args:
         step: compiled `navigator.step`.
         cameras: how many give frames.
         tell: gets the report of each observation, in the tracker's thread.
         odometry: of the rig, by other software, see `add_odometry`; None: there is none.
+        contained: of what an observation raises, which is then left out.
         """
         self._navigator, self._step, self._tell = navigator, step, tell
         self._cameras, self._odometry = cameras, odometry
@@ -52,7 +56,8 @@ class BodyTracker:
         self._sets: dict[int, tuple[float, dict[int, Detections]]] = {}  # by stamp
         self._came = threading.Condition()
         self._closed = False
-        self.late = 0
+        self.late = self._behind = 0
+        self._handle = (contained or Containment()).of("the tracker", self._track)
         self._thread = threading.Thread(target=self._run, name="tracker", daemon=True)
 
     def warm_up(self) -> None:
@@ -68,7 +73,13 @@ class BodyTracker:
         with self._came:
             if self._last_ns is not None and stamp_ns <= self._last_ns:
                 self.late += 1
-                return
+                behind = self._last_ns - stamp_ns >= SET_BACK_NS
+                self._behind = self._behind + 1 if behind else 0
+                if self._behind < SET_BACK_AFTER:
+                    return
+                self._last_ns = None
+                self._sets.clear()
+            self._behind = 0
             self._sets.setdefault(stamp_ns, (time.monotonic(), {}))[1][camera] = detections
             self._came.notify()
 
@@ -89,14 +100,16 @@ class BodyTracker:
 
     def _run(self) -> None:
         while (taken := self._next()) is not None:
-            stamp_ns, frames = taken
-            before_ns = stamp_ns if self._last_ns is None else self._last_ns
-            self._last_ns = stamp_ns
-            obs = self._observation(frames, before_ns, stamp_ns)
-            self._state, output = self._step(self._state, obs)
-            belief = self._state.belief
-            restarts, origin_m = int(belief.restarts), self._navigator.markers.origin_m
-            self._tell(report_of_body(output, belief.bank, restarts, stamp_ns, origin_m))
+            self._handle(*taken)
+
+    def _track(self, stamp_ns: int, frames: dict[int, Detections]) -> None:
+        before_ns = stamp_ns if self._last_ns is None else self._last_ns
+        self._last_ns = stamp_ns
+        obs = self._observation(frames, before_ns, stamp_ns)
+        self._state, output = self._step(self._state, obs)
+        belief = self._state.belief
+        restarts, origin_m = int(belief.restarts), self._navigator.markers.origin_m
+        self._tell(report_of_body(output, belief.bank, restarts, stamp_ns, origin_m))
 
     def _next(self) -> tuple[int, dict[int, Detections]] | None:
         """The next observation's stamp and frames; None: closed."""
@@ -120,6 +133,7 @@ class BodyTracker:
     ) -> Observation:
         count = len(self._navigator.rig)
         lanes = observe([frames.get(c, _NONE) for c in range(count)], self._navigator.markers)
+        hide_nowhere(lanes)
         dtype = np.asarray(self._navigator.corner_sigma_px).dtype
         dt_s, twist = max((stamp_ns - before_ns) / 1e9, 0.0), None
         if self._odometry is not None:

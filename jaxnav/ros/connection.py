@@ -6,6 +6,8 @@
     ...
     connection.close()
 
+Nothing that a callback raises ends the thread that calls back: see `Containment`.
+
 Times in a program are those of `connection.now_ns`: the monotonic clock, or, with `ros_time`, that
 of ROS, which is /clock with `sim_time`.
 """
@@ -14,10 +16,10 @@ import importlib
 import threading
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
-from jaxnav.errors import libraries_silenced
+from jaxnav.errors import BadInput, Containment, libraries_silenced
 from jaxnav.ros.source_clock import SourceClock, SteadyOffset
 
 _QUEUE = 10
@@ -58,6 +60,7 @@ class Connection:
         node: rclpy's node.
         sim_time: whether ROS takes the time of /clock.
         ros_time: whether times are those of ROS, as they are stamped.
+        contained: what callbacks have raised.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class Connection:
         from rclpy.time import Time
 
         self._rclpy, self._Time = rclpy, Time
+        self.contained = Containment()
         self._context = rclpy.Context()
         try:
             with libraries_silenced():  # what is wrong with the words is in the exception too
@@ -118,12 +122,18 @@ class Connection:
         return self.node.create_publisher(message_type(kind), topic, quality)
 
     def listen(
-        self, kind: str, topic: str, take: Callable[[Any], None], latched: bool = False
+        self,
+        kind: str,
+        topic: str,
+        take: Callable[[Any], None],
+        latched: bool = False,
+        failed: Callable[[], None] = lambda: None,
     ) -> Any:
         """Pass every message of a topic to a function, in the thread of `run`.
 
         Args:
             latched: also those that were sent before.
+            failed: called where `take` raises.
 
         Returns:
             The subscription, for `forget`.
@@ -133,7 +143,44 @@ class Connection:
         quality = qos_profile_sensor_data  # best effort, which reliable publishers suit too
         if latched:
             quality = QoSProfile(depth=_LATCHED, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        return self.node.create_subscription(message_type(kind), topic, take, quality)
+        contained = self.contained.of(topic, take, lambda problem, message: failed())
+        return self.node.create_subscription(message_type(kind), topic, contained, quality)
+
+    def every(self, period_s: float, name: str, function: Callable[[], None]) -> None:
+        """Call a function again and again, in the thread of `run`."""
+        self.node.create_timer(period_s, self.contained.of(name, function))
+
+    def serve(
+        self,
+        kind: str,
+        name: str,
+        answer: Callable[..., Any],
+        beside: Callable[[Any], Any] | None = None,
+    ) -> None:
+        """Answer a service whose response has `success` and `message`, in the thread of `run`.
+
+        Args:
+            answer: returns the response to a request, once it is filled in; what it raises is said
+                there.
+            beside: what takes seconds: it is called first, with the request, in a thread of its
+                own, while others are called back; `answer` gets its result too.
+
+        Raises:
+            ImportError: its package is not there.
+        """
+
+        async def answered(request: Any, response: Any) -> Any:
+            try:
+                if beside is None:
+                    return answer(request, response)
+                return answer(request, response, await self._result(partial(beside, request)))
+            except BadInput as bad:
+                response.success, response.message = False, str(bad)
+            except Exception as error:
+                response.success, response.message = False, self.contained.note(name, error)
+            return response
+
+        self.node.create_service(message_type(kind), name, answered)
 
     def forget(self, *ends: Any) -> None:
         """Leave the topics of publishers and subscriptions."""
@@ -196,11 +243,29 @@ class Connection:
     def _ros_ns(self) -> int:
         return int(self.node.get_clock().now().nanoseconds)
 
+    def _result(self, function: Callable[[], Any]) -> Any:
+        """A future of what a function returns in a thread of its own."""
+        from rclpy.task import Future
+
+        future = Future(executor=self._executor)
+
+        def work() -> None:
+            try:
+                result = function()
+            except Exception as error:
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        threading.Thread(target=work, name="beside ROS", daemon=True).start()
+        return future
+
     def _run(self) -> None:
         while not self._closing.is_set():
             try:
                 self.spin_some()
-            except Exception:
-                if self._context.ok():  # else ROS was shut down: publishing says so
-                    raise
-                return
+            except Exception as error:  # of rclpy itself
+                if not self._context.ok():  # ROS was shut down: publishing says so
+                    return
+                self.contained.note("ROS", error)
+                self._closing.wait(_WAIT_S)

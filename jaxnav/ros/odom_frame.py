@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxnav.files.poses import compose, inverse, pose_from_rotation_vector, rotated
+from jaxnav.files.ranges import is_within
 from jaxnav.ros.source_clock import SourceClock
 
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])  # wxyz xyz
@@ -46,7 +47,8 @@ class OdomPose:
         twist = message.twist.twist
         v, w = twist.linear, twist.angular
         rates = np.array([v.x, v.y, v.z, w.x, w.y, w.z])
-        if pose is not None and np.isfinite(rates).all():
+        speeds, turns = is_within("speed_mps", rates[:3]), is_within("turn_radps", rates[3:])
+        if pose is not None and speeds.all() and turns.all():
             self._last = stamp_ns, pose, rates
 
     def at(self, now_ns: int) -> np.ndarray | None:
@@ -138,11 +140,11 @@ class OdomTf:
 
 
 def pose_of(position: Any, orientation: Any) -> np.ndarray | None:
-    """The pose (7,) in two parts of a message; None where it is none."""
+    """The pose (7,) in two parts of a message; None where it is none, or nowhere."""
     p, q = position, orientation
     pose = np.array([q.w, q.x, q.y, q.z, p.x, p.y, p.z])
-    norm = float(np.linalg.norm(pose[:4]))
-    if not norm > 0.5 or not np.isfinite(pose).all():
+    norm = math.hypot(*pose[:4].tolist())
+    if not 0.5 < norm < 2.0 or not is_within("position_m", pose[4:]).all():
         return None
     pose[:4] /= norm
     return pose

@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from jaxnav.files.ranges import RANGES
 from jaxnav.loop.interfaces import GyroReading, Odometry, Reading, TwistOdometry
 from jaxnav.models.twists import TwistReader
 
@@ -58,7 +59,8 @@ def gyro(message: Any, axis: tuple[float, float, float]) -> GyroReading:
 def odometry(
     kind: str, message: Any, twists: TwistReader | None, joints: WheelJoints | None = None
 ) -> Reading:
-    """The reading in a message of one of `ODOMETRY_TYPES`; what is no number is not valid.
+    """The reading in a message of one of `ODOMETRY_TYPES`; a number that no vehicle can have, NaN
+    among them, is not valid.
 
     Args:
         twists: must read all messages of one topic, in their order; None of a base that is no car,
@@ -68,10 +70,16 @@ def odometry(
     if twists is None:
         twist = message.twist if kind == TWIST else message.twist.twist
         parts = float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
-        return TwistOdometry(stamp_ns(message), *parts, valid=all(map(math.isfinite, parts)))
+        valid = _hold("speed_mps", *parts[:2]) and _hold("turn_radps", parts[2])
+        return TwistOdometry(stamp_ns(message), *parts, valid=valid)
     speed_mps, steering_rad = _speed_and_steering(kind, message, twists, joints)
-    finite = math.isfinite(speed_mps) and math.isfinite(steering_rad)
-    return Odometry(stamp_ns(message), speed_mps, steering_rad, valid=finite)
+    valid = _hold("speed_mps", speed_mps) and _hold("steering_rad", steering_rad)
+    return Odometry(stamp_ns(message), speed_mps, steering_rad, valid=valid)
+
+
+def _hold(name: str, *values: float) -> bool:
+    """Whether all values are within the range of a quantity."""
+    return all(map(RANGES[name].holds, values))
 
 
 def _speed_and_steering(
@@ -82,7 +90,10 @@ def _speed_and_steering(
     if kind == JOINTS:
         return (math.nan, math.nan) if joints is None else _of_joints(message, twists, joints)
     twist = message.twist if kind == TWIST else message.twist.twist
-    return twists.read(float(twist.linear.x), float(twist.angular.z))
+    forward_mps, turn_radps = float(twist.linear.x), float(twist.angular.z)
+    if not (_hold("speed_mps", forward_mps) and _hold("turn_radps", turn_radps)):
+        return math.nan, math.nan  # the reader, which holds a steering, must not see it
+    return twists.read(forward_mps, turn_radps)
 
 
 def _of_joints(message: Any, twists: TwistReader, joints: WheelJoints) -> tuple[float, float]:
@@ -92,6 +103,8 @@ def _of_joints(message: Any, twists: TwistReader, joints: WheelJoints) -> tuple[
         rates = [float(message.velocity[names.index(name)]) for name in joints.driven]
         angles = [float(message.position[names.index(name)]) for name in joints.steered]
     except (ValueError, IndexError):  # another robot's joints, or a message without rates
+        return math.nan, math.nan
+    if not (_hold("turn_radps", *rates) and _hold("steering_rad", *angles)):
         return math.nan, math.nan
     steering_rad = sum(angles) / len(angles)
     rear_mps = joints.radius_m * sum(rates) / len(rates)

@@ -12,10 +12,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxnav.files.poses import inverse, matrix
+from jaxnav.files.ranges import is_within
 from jaxnav.models.odometry_errors import OdometryErrors, sigma_as_told
 
 _MAX_GAP_S = 0.5  # between two poses; what happened in a longer one is not known
 _KEPT = 1024  # poses of a track that grows: 2 s at 500 Hz
+# So many stamps in a row that are that far behind: their clock was set back, or one was absurd.
+SET_BACK_AFTER, SET_BACK_NS = 10, 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,16 @@ class OdometryTrack:
 
         Returns:
             (F, 6) m/s and rad/s in the vehicle's axes, with exp(twist dt) the motion; NaN where a
-            pose of either time is not known, and for the first.
+            pose of either time is not known, where nothing moves like that, and for the first.
         """
         twists = np.full((len(stamps_ns), 6), np.nan)
         known, places = self._at(stamps_ns)
         dt_s = np.diff(stamps_ns) / 1e9
         rows = np.flatnonzero(known[1:] & known[:-1] & (dt_s > 0))
         steps = np.linalg.inv(places[rows]) @ places[rows + 1]
-        twists[rows + 1] = _logarithms(steps) / dt_s[rows, None]
+        found = _logarithms(steps) / dt_s[rows, None]
+        can_be = is_within("speed_mps", found[:, :3]) & is_within("turn_radps", found[:, 3:])
+        twists[rows + 1] = np.where(can_be.all(axis=1, keepdims=True), found, np.nan)
         return twists
 
     def rotations(
@@ -92,10 +97,15 @@ class GrowingTrack:
         self._delay_ns = round(delay_s * 1e9)
         self._T_vehicle_sensor = T_vehicle_sensor
         self._poses: deque[tuple[int, np.ndarray]] = deque(maxlen=_KEPT)
+        self._behind = 0  # poses in a row
 
     def add(self, stamp_ns: int, T_odom_sensor: Float[np.ndarray, " 7"]) -> None:
         """Take a pose (7,) wxyz xyz; one that is older than the last is left out."""
         taken_ns = stamp_ns - self._delay_ns
+        behind = self.reaches(taken_ns + SET_BACK_NS)
+        self._behind = self._behind + 1 if behind else 0
+        if self._behind >= SET_BACK_AFTER:
+            self._poses.clear()
         if not self.reaches(taken_ns):
             self._poses.append((taken_ns, T_odom_sensor))
 

@@ -38,7 +38,11 @@ class FrameNames:
 
 
 class Publisher:
-    """The publisher of one node's estimates. `close` ends its thread."""
+    """The publisher of one node's estimates. `close` ends its thread.
+
+    Attributes:
+        send_transform, publish, show_map: see `_send_transform` and so on; they raise nothing.
+    """
 
     def __init__(
         self,
@@ -68,16 +72,20 @@ class Publisher:
         ]  # fmt: skip
         if self._bank is not None:
             self._publishers.append(self._bank)
-        self.show_map(markers)
         self._latest: Report | None = None
         self._closing, self._due = threading.Event(), threading.Event()
         self._told_s = 0.0
         self._delays = Statistics()
-        self.failed: str | None = None
+        contained = connection.contained  # ROS refuses what it can't send
+        self.send_transform = contained.of("publishing tf", self._send_transform)
+        self.publish = contained.of("publishing the pose", self._publish)
+        self.show_map = contained.of("publishing the map", self._show_map)
+        self._tell_others = contained.of("publishing the bank", self._publish_others)
+        self.show_map(markers)
         self._thread = threading.Thread(target=self._tell, name="ros publisher", daemon=True)
         self._thread.start()
 
-    def send_transform(
+    def _send_transform(
         self, now_ns: int, T_map_base: np.ndarray, seen_ns: int | None = None
     ) -> None:
         """Send tf of a decided pose (7,), which others wait for before all else.
@@ -99,27 +107,21 @@ class Publisher:
         one.header.frame_id, one.child_frame_id = self._frames.map, child
         _place(one.transform.translation, one.transform.rotation, pose)
         message.transforms = [one]
-        try:
-            self._connection.publish(self._tf, message)
-        except OSError as error:
-            self.failed = str(error)
+        self._connection.publish(self._tf, message)
         if seen_ns is not None:
             late_ms = (self._connection.now_ns() - seen_ns) / 1e6
             self._delays.add(_DELAY, max(late_ms, 0.0))
 
-    def publish(self, report: Report) -> None:
+    def _publish(self, report: Report) -> None:
         """Send an estimate but for its transform; a pose that is not decided is not sent."""
-        try:
-            if report.decided and report.is_finite:
-                self._publish_pose(report)
-        except OSError as error:
-            self.failed = str(error)
         before, self._latest = self._latest, report
         # A start lasts for some frames only: what is new about it is told at once.
         if before is None or (before.located, before.decided) != (report.located, report.decided):
             self._due.set()
+        if report.decided and report.is_finite:
+            self._publish_pose(report)
 
-    def show_map(self, markers: MarkerMap) -> None:
+    def _show_map(self, markers: MarkerMap) -> None:
         """Send a picture of the map to whoever listens, now or later."""
         message = message_type("visualization_msgs/msg/MarkerArray")()
         poses = np.asarray(markers.Ts_world_marker.wxyz_xyz, float)
@@ -166,13 +168,13 @@ class Publisher:
             if report is None or report is told:
                 continue
             told = report
-            try:
-                self._publish_bank(report)
-                if time.monotonic() - self._told_s > _DIAGNOSTICS_S:
-                    self._told_s = time.monotonic()
-                    self._publish_diagnostics(report)
-            except OSError as error:
-                self.failed = str(error)
+            self._tell_others(report)
+
+    def _publish_others(self, report: Report) -> None:
+        if time.monotonic() - self._told_s > _DIAGNOSTICS_S:
+            self._told_s = time.monotonic()
+            self._publish_diagnostics(report)
+        self._publish_bank(report)
 
     def _publish_bank(self, report: Report) -> None:
         held = report.hypotheses()
@@ -236,6 +238,7 @@ class Publisher:
             "restarts": report.restarts,
             "faults": ", ".join(report.faults),
             "rejects": ", ".join(report.rejects),
+            "raised": self._connection.contained.summary() or "",
             "camera_to_tf_ms": f"{self._delays.quantile_ms(_DELAY, 0.5):.2f}",
             "camera_to_tf_99_ms": f"{self._delays.quantile_ms(_DELAY, 0.99):.2f}",
         }

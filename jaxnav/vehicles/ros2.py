@@ -25,7 +25,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import MOST_TURNS, AnyVehicle, GyroReading, Reading, Setup
+from jaxnav.loop.interfaces import (
+    MOST_TURNS,
+    AnyVehicle,
+    GyroReading,
+    Reading,
+    Setup,
+    reading_of,
+)
 from jaxnav.loop.limits import Command, limits_of, turns_by_twist
 from jaxnav.models.twists import TwistReader, twist_of
 from jaxnav.ros.connection import Connection, message_type
@@ -108,11 +115,12 @@ class RosVehicle:
             self._publisher = self._connection.publisher(kind, topic)
             self._command_type = message_type(kind)
         self._stamped = command == "ackermann"
-        self._connection.listen(self._kind, self._topic, self._take)
+        self._connection.listen(self._kind, self._topic, self._take, failed=self._take_nothing)
         if "imu_topic" in options:
             self._axis = _axis(options)
             self._gyro_clock = self._connection.source_clock()
-            self._connection.listen(IMU, options["imu_topic"], self._take_turn)
+            topic = options["imu_topic"]
+            self._connection.listen(IMU, topic, self._take_turn, failed=self._take_no_turn)
         self._connection.run()
         end_s = time.monotonic() + _HEARD_WITHIN_S
         while not self._is_heard and time.monotonic() < end_s:
@@ -210,9 +218,17 @@ class RosVehicle:
         stamp_ns = self._clock.time_ns(message.header.stamp)
         self._reading = replace(reading, stamp_ns=stamp_ns)
 
+    def _take_nothing(self) -> None:
+        """A message that can't be read is an invalid reading of now, which the loop flags."""
+        nothing = [0.0] * len(self._limits.zero)
+        self._reading = reading_of(self._connection.now_ns(), nothing, valid=False)
+
     def _take_turn(self, message: Any) -> None:
         stamp_ns = self._gyro_clock.time_ns(message.header.stamp)
         self._turns.append(replace(gyro(message, self._axis), stamp_ns=stamp_ns))
+
+    def _take_no_turn(self) -> None:
+        self._turns.append(GyroReading(self._connection.now_ns(), math.nan))
 
 
 def _axis(options: Mapping[str, str]) -> tuple[float, float, float]:

@@ -91,20 +91,23 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
 
     def take(camera: RosCamera, clock: SourceClock, message: Any) -> None:
         stamp_ns = clock.time_ns(message.header.stamp)
-        try:
-            if kind == APRILTAG_ROS:
-                frame = Frame(stamp_ns, detections=seen(message))
-            else:
-                frame = Frame(stamp_ns, grey_image(kind, message))
-        except ValueError:  # an encoding that nobody reads: reported as a frame without a picture
-            frame = Frame(stamp_ns)
-        camera.add(frame)
+        if kind == APRILTAG_ROS:
+            camera.add(Frame(stamp_ns, detections=seen(message)))
+        else:
+            camera.add(Frame(stamp_ns, grey_image(kind, message)))
+
+    def take_nothing(camera: RosCamera) -> None:
+        """A message that can't be read is a frame of now without a picture, which is flagged."""
+        camera.add(Frame(connection.now_ns()))
 
     cameras = [RosCamera(name, connection.close) for name in names]
     for camera in cameras:
         if camera.name in topics:
             connection.listen(
-                kind, topics[camera.name], partial(take, camera, connection.source_clock())
+                kind,
+                topics[camera.name],
+                partial(take, camera, connection.source_clock()),
+                failed=partial(take_nothing, camera),
             )
     connection.run()
     return list(cameras)

@@ -72,6 +72,18 @@ def test_each_reads_its_own_kind_and_finite_numbers(car, base):
     assert not base.reads(TwistOdometry(0, 0.1, math.nan, 0.2))
 
 
+@given(st.tuples(st.floats(), st.floats(), st.floats()))
+def test_a_reading_is_one_that_a_vehicle_can_have(car, base, values):
+    speed_mps, other, _ = values
+    told = Odometry(0, speed_mps, other)
+    most = 1e3 * (1 + 1e-6), 63 * (1 + 1e-6)  # see `Range.holds`
+    assert car.reads(told) == bool(abs(speed_mps) <= most[0] and abs(other) <= most[1])
+    if car.reads(told):
+        assert all(map(math.isfinite, car.motion(told)))
+    told = TwistOdometry(0, *values)
+    assert base.reads(told) == all(abs(value) <= most[0] for value in values)
+
+
 class Wheels:
     """Readings of a base every 20 ms, with a lag of first order."""
 

@@ -74,6 +74,12 @@ def test_a_reading_that_is_no_rate_is_a_hole(bad):
     assert mean(track, 30, 40) == pytest.approx(1.25)
 
 
+def test_of_a_gyro_without_a_limit_no_rate_is_beyond_what_turns():
+    track = GyroTrack(math.inf)
+    assert told(track, [1.0, 1e30]) == Fault.GYRO_INVALID
+    assert told(track, [999.0], begin_ms=30) == Fault(0)
+
+
 def test_one_that_repeats_itself_is_stuck_and_one_that_stands_at_zero_is_not():
     track = GyroTrack(LIMIT_RADPS)
     assert told(track, [0.0] * 2 * STUCK_AFTER) == Fault(0)

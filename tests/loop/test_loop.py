@@ -116,7 +116,7 @@ def standing() -> Throttle:
 class Drive:
     """A loop that runs in a thread of its own."""
 
-    def __init__(self, pilot, car=None, resumes=False, lasts_s=3.0):
+    def __init__(self, pilot, car=None, observers=(), resumes=False, lasts_s=3.0):
         self.car, self.pilot, self.lasts_s = car or Car(), pilot, lasts_s
         pilot.act = lambda: None
         pilot.handled.clear()
@@ -128,7 +128,7 @@ class Drive:
         now_ns = lambda: self.clock()  # noqa: E731
         self.said = []
         self.loop = Loop(
-            pilot, self.guard, self.car, self.eyes, now_ns=now_ns, say=self.said.append
+            pilot, self.guard, self.car, self.eyes, observers, now_ns=now_ns, say=self.said.append
         )
         self.ended = None
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -358,6 +358,45 @@ def test_it_ends_in_good_order_when_the_vehicle_has_nothing_more_to_drive(standi
         drive.thread.join(1)
         assert drive.ended == "the tape is over"
         assert not drive.loop.stopped
+
+
+class Onlooker:
+    """Counts what it is told, and raises at one thing."""
+
+    def __init__(self, raises=""):
+        self.raises, self.told = raises, dict.fromkeys(("on_outcome", "on_frame", "faults"), 0)
+
+    def _tell(self, what):
+        self.told[what] += 1
+        if what == self.raises:
+            raise ValueError("math domain error")
+        return Fault(0)
+
+    def on_outcome(self, given, outcome):
+        self._tell("on_outcome")
+
+    def on_frame(self, name, frame, sighted):
+        self._tell("on_frame")
+
+    @property
+    def faults(self):
+        return self._tell("faults")
+
+
+@pytest.mark.parametrize("what", ["on_outcome", "on_frame", "faults"])
+def test_an_observer_that_raises_ends_nothing_and_is_named_counted_and_a_fault(
+    standing, what, capsys
+):
+    raises, sound = Onlooker(what), Onlooker()
+    with Drive(standing, observers=(raises, sound)) as drive:
+        drive.until(lambda: raises.told[what] > 5 and sound.told[what] > 5)
+        assert drive.ended is None
+    name = f"Onlooker.{what}"
+    assert drive.loop.contained.counts[name] > 5
+    flagged = [given for given in standing.handled if Fault.RECORDER_FAILED in given.faults]
+    assert len(flagged) > 3
+    said = capsys.readouterr().err
+    assert said.count(f"{name}: ValueError: math domain error") == 1
 
 
 def test_a_drive_that_the_guard_ends_was_stopped(standing):

@@ -97,6 +97,14 @@ def test_to_warm_up_leaves_no_trace(setup, steps, inputs):
     assert digest(pilot.handle(inputs[0])) == digest(steps[0].outcome)
 
 
+def test_pilots_of_a_setup_share_one_program(setup, tmp_path):
+    """Each that is loaded takes over 100 MB, and a node makes a pilot at every reset."""
+    programs = [setup.pilot(folder)._estimator._program for folder in (None, None, *[tmp_path] * 2)]
+    assert programs[0] is programs[1]
+    assert programs[2] is programs[3]
+    assert dataclasses.replace(setup).pilot(None)._estimator._program is not programs[0]
+
+
 def _stamp_ns(given: Input) -> int:
     return given.frames[0].stamp_ns if given.frames else given.odometry.stamp_ns
 
@@ -239,8 +247,9 @@ def _one_nan(corners_px: np.ndarray) -> np.ndarray:
         (_odometry_with(speed_mps=-math.inf), Fault.ODOMETRY_INVALID, Reject(0)),
         (_odometry_with(steering_rad=math.nan), Fault.ODOMETRY_INVALID, Reject(0)),
         (_odometry_with(valid=False), Fault.ODOMETRY_INVALID, Reject(0)),
-        (_odometry_with(speed_mps=1e300), Fault(0), Reject.ODOMETRY),
-        (_odometry_with(steering_rad=1e300), Fault(0), Reject(0)),
+        (_odometry_with(speed_mps=999.0), Fault(0), Reject.ODOMETRY),
+        (_odometry_with(speed_mps=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
+        (_odometry_with(steering_rad=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
         (_frame_with(corners_px=lambda c: c * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=lambda c: c + math.inf), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=_one_nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
@@ -249,7 +258,8 @@ def _one_nan(corners_px: np.ndarray) -> np.ndarray:
         (_frame_with(sigma_px=lambda s: s * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(sigma_px=lambda s: s * 0), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(sigma_px=lambda s: s - 1), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(sigma_px=lambda s: s * 1e300), Fault(0), Reject(0)),
+        (_frame_with(sigma_px=lambda s: s * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        (_frame_with(sigma_px=lambda s: s * 1e-300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(ids=lambda i: i.astype(int) + 9), Fault.UNKNOWN_MARKER, Reject(0)),
     ],
 )

@@ -182,6 +182,8 @@ def test_who_is_held_fast_stands_still(setup):
 BAD = [
     TwistOdometry(BEGIN_NS, math.nan, 0.0, 0.0),
     TwistOdometry(BEGIN_NS, 0.0, math.inf, 0.0),
+    TwistOdometry(BEGIN_NS, 1e308, 0.0, 0.0),
+    TwistOdometry(BEGIN_NS, 0.0, 0.0, 1e30),
     TwistOdometry(BEGIN_NS, 0.0, 0.0, 0.0, valid=False),
     Odometry(BEGIN_NS, 0.1, 0.0),  # a car's
 ]

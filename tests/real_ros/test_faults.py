@@ -7,12 +7,23 @@ import time
 
 import numpy as np
 
+from jaxnav.detection.types import Detections
+from jaxnav.files import calib_dir
 from jaxnav.loop.flags import Fault, Health
 from jaxnav.recording.drive_log import read_drive
+from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
 from jaxnav.ros.connection import message_type
+from jaxnav.ros.odometry_messages import NAV_ODOMETRY
 from tests.real_ros.processes import Program, node, sim_car, until
 from tests.real_ros.relay import CAMERAS
-from tests.real_ros.test_node_drives import PATIENT, Listener, pose_of, stamp_s, write_file
+from tests.real_ros.test_node_drives import (
+    PATIENT,
+    Listener,
+    answer_of,
+    pose_of,
+    stamp_s,
+    write_file,
+)
 
 TEXT = "std_msgs/msg/String"
 LASTS_S = 1.6  # a fault; longer than a stamp may be old
@@ -27,6 +38,12 @@ FAULTS = {
     "cameras jumps": (Fault.STAMP_INVALID, Health.OK),
 }
 KILLED = STALE, Health.STOP
+OTHER_MARKER = """
+  - id: 7
+    family: tag36h11
+    size_m: 0.172
+    T_world_marker: [[1, 0, 0, 3], [0, 0, -1, 1.47], [0, 1, 0, 0.2], [0, 0, 0, 1]]
+"""
 
 
 def relay(folder, number: int) -> Program:
@@ -95,6 +112,80 @@ def test_publishers_that_repeat_jump_and_die(tmp_path):
             assert abs(throttle) <= most + 1e-6, (name, one)
     first_ns = min(begin_ns for begin_ns, _ in happened.values())
     check_errors(listener, (first_ns + time.time_ns() - time.monotonic_ns()) / 1e9)
+
+
+def test_nothing_that_is_sent_ends_it_and_a_map_that_is_refused_changes_nothing(tmp_path):
+    """Numbers that no vehicle has on every topic, and services that are asked for nonsense."""
+    listener = Listener()
+    ros = listener.connection
+    load = "jaxnav_msgs/srv/LoadMarkers", "/jaxnav/load_markers"
+    markers = (calib_dir() / "qcar/markers.yaml").read_text()
+    (tmp_path / "two.yaml").write_text(markers + OTHER_MARKER)
+    (tmp_path / "bad.yaml").write_text(markers.replace("size_m", "size"))
+    odometry = ros.publisher(NAV_ODOMETRY, "/odom")
+    seen = [ros.publisher(APRILTAG_ROS, f"/{name}/detections") for name in CAMERAS]
+    try:
+        words = (str(write_file(tmp_path)), *PATIENT, "--record", str(tmp_path / "drive.mcap"))
+        with sim_car(tmp_path), node(tmp_path, *words) as program:
+            until(listener.drives, 240.0, program)
+            for value in (1e308, -1e30, 1e9, np.inf, np.nan):
+                for _ in range(5):
+                    ros.publish(odometry, absurd_odometry(value, ros))
+                    for publisher in seen:
+                        ros.publish(publisher, absurd_detections(value, ros))
+                    time.sleep(0.02)
+            until(listener.drives, 30.0, program)
+            # Refused: it drives on, in the map that it had.
+            restarts = listener.last("/jaxnav/bank").restarts
+            listener.forget()
+            for path in ("none.yaml", "bad.yaml", "x" * 100_000, ""):
+                answer = answer_of(listener, *load, {"path": path})
+                assert not answer.success, path[:20]
+                assert len(answer.message) < 1100
+            assert not answer_of(
+                listener, "jaxnav_msgs/srv/Save", "/jaxnav/save", {"folder": "x" * 100_000}
+            ).success
+            until(lambda: listener.heard["/jaxnav/bank"], 10.0, program)
+            assert all(bank.located for bank in listener.heard["/jaxnav/bank"])
+            assert listener.last("/jaxnav/bank").restarts == restarts
+            # Accepted: it drives on until all is compiled, then in the new map.
+            begun_anew = answer_of(listener, *load, {"path": "two.yaml"})
+            assert begun_anew.success, begun_anew.message
+            listener.forget()
+            until(listener.decided, 60.0, program)
+            assert "ended" not in program.said
+            assert "Traceback" not in program.said
+            program.tell(signal.SIGTERM)
+            assert program.ends() == 128 + signal.SIGTERM, program.said
+    finally:
+        ros.close()
+    seen_faults = Fault(0)
+    for flag in np.asarray(read_drive(tmp_path / "drive.mcap").outcomes.faults):
+        seen_faults |= Fault(int(flag))
+    assert Fault.ODOMETRY_INVALID | Fault.CORNERS_NOT_FINITE in seen_faults
+
+
+def absurd_odometry(value: float, ros):
+    """A nav_msgs/Odometry of now, all of whose numbers are this one."""
+    message = message_type(NAV_ODOMETRY)()
+    message.header.stamp = ros.stamp(ros.now_ns())
+    pose, twist = message.pose.pose, message.twist.twist
+    for part in (pose.position, pose.orientation, twist.linear, twist.angular):
+        for axis in part.get_fields_and_field_types():
+            setattr(part, axis, value)
+    return message
+
+
+def absurd_detections(value: float, ros):
+    """A detection of the map's marker all of whose corners are there."""
+    found = Detections(
+        np.zeros(1, int),
+        np.full((1, 4, 2), value),
+        np.ones((1, 4)),
+        np.ones(1, bool),
+        ("tag36h11",),
+    )
+    return detections_message(found, ros.stamp(ros.now_ns()))
 
 
 def tell(listener: Listener, publisher, text: str) -> None:

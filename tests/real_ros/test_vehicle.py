@@ -153,7 +153,9 @@ def test_a_stamp_of_another_clock_is_the_time_of_arrival(peer, vehicle, age_ns):
 
 
 def test_what_is_no_number_is_not_valid(peer, vehicle):
-    assert not reading_after(vehicle, lambda: peer.send(NAV_ODOMETRY, nav_odometry(math.nan))).valid
+    for bad in (math.nan, math.inf, 1e308):
+        told = nav_odometry(bad)
+        assert not reading_after(vehicle, lambda told=told: peer.send(NAV_ODOMETRY, told)).valid
     assert reading_after(vehicle, lambda: peer.send(NAV_ODOMETRY, nav_odometry())).valid
 
 
@@ -213,6 +215,54 @@ def test_a_ros_that_is_gone_is_an_oserror(vehicle):
     with pytest.raises(OSError, match="ROS: "):
         vehicle.write(0.0, 0.1)
     vehicle._closed = True  # nothing is left to close
+
+
+def test_whatever_a_callback_raises_it_is_called_again(peer, capfd):
+    connection, calls = Connection("raises"), dict.fromkeys(("take", "failed", "timer"), 0)
+
+    def raises(name):
+        def call(*arguments):
+            calls[name] += 1
+            raise ValueError(f"{name} at {calls[name]}")
+
+        return call
+
+    trigger = "std_srvs/srv/Trigger"
+    try:
+        connection.listen(NAV_ODOMETRY, "/odom", raises("take"), failed=raises("failed"))
+        connection.every(0.02, "the timer", raises("timer"))
+        connection.serve(trigger, "~/answers", lambda request, response: 1 / 0)
+        connection.serve(trigger, "~/beside", lambda *told: None, lambda request: 1 / 0)
+        connection.run()
+        until(lambda: min(calls.values()) > 2 or peer.send(NAV_ODOMETRY, nav_odometry()), 30.0)
+        for name in ("answers", "beside", "answers"):
+            service = message_type(trigger)
+            client = peer.connection.node.create_client(service, f"/raises/{name}")
+            assert client.wait_for_service(30.0)
+            answer = client.call_async(service.Request())
+            until(answer.done, 30.0)
+            assert not answer.result().success
+            problem = "ZeroDivisionError: division by zero"
+            assert answer.result().message == f"~/{name}: {problem}"
+        before = calls["timer"]
+        until(lambda: calls["timer"] > before, 10.0)
+    finally:
+        connection.close()
+    said = capfd.readouterr().err
+    assert said.count("/odom: ValueError: take at 1") == 1
+    assert said.count("the timer: ValueError: timer at 1") == 1
+    assert set(connection.contained.counts) == {"/odom", "the timer", "~/answers", "~/beside"}
+
+
+def test_a_message_that_raises_is_an_invalid_reading_and_the_next_is_none(
+    peer, vehicle, monkeypatch
+):
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxnav.vehicles.ros2.odometry", lambda *told: 1 / 0)
+        bad = reading_after(vehicle, lambda: peer.send(NAV_ODOMETRY, nav_odometry()))
+        assert not bad.valid
+        assert abs(time.monotonic_ns() - bad.stamp_ns) < 5 * 10**9
+    assert reading_after(vehicle, lambda: peer.send(NAV_ODOMETRY, nav_odometry())).valid
 
 
 def test_a_message_that_hangs_holds_up_neither_a_stop_nor_the_end(vehicle, monkeypatch):

@@ -1,6 +1,7 @@
 """A rig that moves freely, its messages in any order, against one step after the other."""
 
 import time
+from dataclasses import replace
 from types import SimpleNamespace as Named
 
 import jax
@@ -16,7 +17,7 @@ from jaxnav.files.poses import compose, inverse
 from jaxnav.navigator import Navigator
 from jaxnav.pose.observation import Observation
 from jaxnav.ros.body import BodyTracker
-from jaxnav.ros.odom_frame import OdomPose
+from jaxnav.ros.odom_frame import IDENTITY, OdomPose
 from jaxnav.ros.odometry_track import GrowingTrack
 from tests import worlds
 
@@ -36,6 +37,11 @@ def navigator() -> Navigator:
         motion=ConstantVelocity(),
         corner_sigma_px=0.3,
     )
+
+
+@pytest.fixture(scope="module")
+def stepped(navigator):
+    return jax.jit(navigator.step)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +116,58 @@ def test_what_comes_in_any_order_is_taken_in_the_order_of_its_stamps(navigator, 
         state, out = step(state, obs)
         expected = np.asarray(out.T_world_vehicle.wxyz_xyz, float)
         np.testing.assert_allclose(report.T_map_base, expected, atol=1e-6)
+
+
+class Alone:
+    """A tracker without a thread, its step that of the navigator."""
+
+    def __init__(self, navigator, step):
+        track = GrowingTrack(np.asarray(T_VEHICLE_SENSOR.wxyz_xyz))
+        self.reports, self.count = [], len(navigator.rig)
+        self.tracker = BodyTracker(navigator, step, self.count, self.reports.append, track)
+
+    def take(self, obs, stamp_ns, change=lambda found: found):
+        for camera in range(self.count):
+            self.tracker.add(camera, stamp_ns, change(detections(obs, camera)))
+        self.tracker.add_odometry(stamp_ns, IDENTITY)
+        self.tracker._handle(*self.tracker._next())
+        return self.reports[-1]
+
+
+@pytest.mark.parametrize("value", [1e308, -1e30, np.inf, np.nan, 1e-300, -1.0])
+@pytest.mark.parametrize("name", ["corners_px", "sigma_px"])
+def test_an_absurd_frame_is_left_out(navigator, frames, stepped, name, value):
+    alone = Alone(navigator, stepped)
+    alone.take(frames[0], 1_000_000_000)
+
+    def change(found):
+        return replace(found, **{name: np.full_like(getattr(found, name), value)})
+
+    for number in range(3):
+        report = alone.take(frames[0], 1_100_000_000 + 100_000_000 * number, change)
+        assert report.is_finite
+    report = alone.take(frames[0], 1_500_000_000)
+    assert report.is_finite
+    assert report.located
+
+
+def test_a_stamp_of_another_year_does_not_end_it(navigator, frames, stepped):
+    """Nor one in the odometry: nothing comes after it for good."""
+    alone = Alone(navigator, stepped)
+    alone.take(frames[0], 1_000_000_000)
+    alone.take(frames[0], 2**61)
+    last = len(alone.reports)
+    for number in range(5):
+        stamp_ns = 1_100_000_000 + 100_000_000 * number
+        for camera in range(alone.count):
+            alone.tracker.add(camera, stamp_ns, detections(frames[0], camera))
+        for _ in range(4):
+            alone.tracker.add_odometry(stamp_ns + 1, IDENTITY)
+    alone.tracker._handle(*alone.tracker._next())
+    assert len(alone.reports) == last + 1
+    assert alone.reports[-1].now_ns < 2_000_000_000
+    assert alone.tracker._odometry.reaches(1_500_000_000)
+    assert not alone.tracker._odometry.reaches(2**60)
 
 
 def test_an_odometry_s_body_elsewhere_on_the_rig_is_taken_for_it():

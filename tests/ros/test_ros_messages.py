@@ -1,6 +1,7 @@
 """The content of ROS messages: steering from a yaw rate, the order of corners, image pixels."""
 
 import math
+from types import SimpleNamespace as Named
 
 import cv2
 import jax
@@ -12,10 +13,24 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from jaxnav.detection import make_detector, marker_cells
+from jaxnav.loop.chassis import chassis_of
 from jaxnav.loop.flags import Fault
 from jaxnav.models import bicycle
+from jaxnav.models.twist_base import TwistBase
 from jaxnav.models.twists import STANDSTILL_MPS, TwistReader
 from jaxnav.ros.camera_messages import grey_image
+from jaxnav.ros.odom_frame import OdomPose, OdomTf
+from jaxnav.ros.odometry_messages import (
+    ACKERMANN,
+    JOINTS,
+    NAV_ODOMETRY,
+    ODOMETRY_TYPES,
+    TWIST,
+    TWIST_TYPES,
+    WheelJoints,
+    odometry,
+)
+from jaxnav.ros.source_clock import SourceClock
 from tests.helpers.ros_bags import IMAGE, Bag
 from tests.helpers.ros_drives import BEGIN_NS, problem, read, topic_map
 from tests.worlds import paper_markers, qcar
@@ -53,6 +68,64 @@ def test_whatever_a_twist_says_the_steering_stays_inside_its_limit(twists):
         else:
             assert math.isnan(speed_mps)
             assert math.isnan(steering_rad)
+
+
+AXES = st.builds(Named, x=st.floats(), y=st.floats(), z=st.floats(), w=st.floats())
+HEADER = Named(stamp=Named(sec=1, nanosec=0), frame_id="odom")
+BASE = TwistBase.create(1.0, 4.0, 0.15)
+JOINT = WheelJoints(("rear",), ("front",), 0.03)
+
+
+@st.composite
+def said(draw, kind) -> Named:
+    """A message of a kind, with any float in any field."""
+    twist = Named(linear=draw(AXES), angular=draw(AXES))
+    pose = Named(position=draw(AXES), orientation=draw(AXES))
+    if kind == ACKERMANN:
+        drive = Named(speed=draw(st.floats()), steering_angle=draw(st.floats()))
+        return Named(header=HEADER, drive=drive)
+    if kind == JOINTS:
+        rates, angles = (draw(st.lists(st.floats(), min_size=1, max_size=3)) for _ in range(2))
+        return Named(header=HEADER, name=["rear", "front"], velocity=rates, position=angles)
+    if kind == TWIST:
+        return Named(header=HEADER, twist=twist)
+    return Named(header=HEADER, twist=Named(twist=twist), pose=Named(pose=pose))
+
+
+@pytest.mark.parametrize("kind", ODOMETRY_TYPES)
+@drawn(st.data())
+def test_any_float_in_any_field_is_a_reading_that_can_be_or_an_invalid_one(kind, data):
+    twists, car = TwistReader(0.256, 0.5), chassis_of(qcar())
+    twists.read(1.0, 2.0)
+    held_rad = twists.read(0.0, 0.0)[1]
+    message = data.draw(said(kind))
+    reading = odometry(kind, message, twists, JOINT)
+    assert not reading.valid or car.reads(reading)
+    if math.isnan(reading.values[0]):  # nor does it change what comes after it
+        assert twists.read(0.0, 0.0)[1] == held_rad
+    if kind in TWIST_TYPES:
+        reading = odometry(kind, message, None)
+        assert not reading.valid or chassis_of(BASE).reads(reading)
+
+
+@drawn(st.data())
+def test_any_float_in_a_pose_that_goes_on_stays_finite(data):
+    """Of the odometry's own messages, and of tf."""
+    of_pose = OdomPose()
+    of_tf = OdomTf("odom", "base_link", lambda: SourceClock(None))
+    for count in range(3):
+        message = data.draw(said(NAV_ODOMETRY))
+        of_pose.add(count, message)
+        moved = Named(
+            translation=message.pose.pose.position, rotation=message.pose.pose.orientation
+        )
+        stamp = Named(sec=1, nanosec=count)
+        header = Named(stamp=stamp, frame_id="odom")
+        one = Named(header=header, child_frame_id="base_link", transform=moved)
+        of_tf.take(Named(transforms=[one]))
+        for odom in (of_pose, of_tf):
+            pose = odom.at(1_000_000_000 + 100_000_000)
+            assert pose is None or np.isfinite(pose).all()
 
 
 def test_odometry_at_its_limits(tmp_path):

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxnav.errors import Containment
 from jaxnav.loop.camera_delays import CameraDelays, Delay
+from jaxnav.loop.chassis import chassis_of
 from jaxnav.loop.corrections import Corrections
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections, FrameIntake
@@ -37,6 +39,8 @@ class DelayWatch:
         car = setup.car(Path("the drive"))
         self._delays = CameraDelays(setup.rig, setup.markers, car)
         self._faults = Fault(0)
+        # What it raises must not end the thread, which nobody would notice.
+        self._solve = Containment().of("the delay watch", self._delays.solve)
         self._wake, self._closing = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="jaxnav-delays", daemon=True)
         self._thread.start()
@@ -75,7 +79,7 @@ class DelayWatch:
             self._wake.wait()
             self._wake.clear()
             while self._delays.due and not self._closing:
-                self._delays.solve()
+                self._solve()
             if self._delays.late and not self._faults:
                 self._faults = Fault.CAMERA_LATE
                 if self._warns:
@@ -119,7 +123,7 @@ def _agree(one: Delay, together: Delay) -> bool:
 def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
     """The delays of the cameras in the recorded drive of a car."""
     delays = CameraDelays(setup.rig, setup.markers, setup.car(Path("the drive")))
-    corrections = Corrections.of(setup.vehicle)
+    corrections, chassis = Corrections.of(setup.vehicle), chassis_of(setup.vehicle)
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     outcomes = log.outcomes
     poses = planar_in_world(outcomes.pose, opposite(setup.markers.origin_m))
@@ -129,7 +133,7 @@ def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
         read = given.odometry
         if read is not None and read.valid:
             right = corrections.correct_reading(read)
-            if isinstance(right, Odometry) and all(map(math.isfinite, right.values)):
+            if isinstance(right, Odometry) and chassis.reads(right):
                 delays.add_reading(right.stamp_ns, right.speed_mps, right.steering_rad)
         seen, stamp_ns, _ = frames.check(
             [corrections.correct_frame(f) for f in given.frames], given.now_ns

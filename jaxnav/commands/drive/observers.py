@@ -1,10 +1,11 @@
 """Observers of `jaxnav run`: the recording, Rerun's window, the delay watch, the status line.
 
-None of them waits for a disk or a screen, and none raises: see `Observer`.
+None of them waits for a disk or a screen: see `Observer`.
 """
 
 import math
 import sys
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -14,6 +15,7 @@ import numpy as np
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.learnt_watch import LearntWatch
+from jaxnav.errors import Containment
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame
@@ -62,7 +64,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     onlookers: list[Onlooker] = []
 
     def add(onlooker: Onlooker) -> None:
-        closing.callback(onlooker.close)
+        closing.callback(Containment().of(f"{type(onlooker).__name__}.close", onlooker.close))
         onlookers.append(onlooker)
 
     if args.record is not None:
@@ -78,6 +80,21 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if not args.headless:
         add(StatusLine())
     return onlookers
+
+
+def closing_notes(onlookers: Iterable[Onlooker], contained: Containment) -> Iterator[str]:
+    """What closed onlookers sum up, and in the end what they have raised.
+
+    Args:
+        contained: of what they have raised, and raise now.
+    """
+    for onlooker in onlookers:
+        name = f"{type(onlooker).__name__}.closing_note"
+        note = contained.of(name, lambda one: one.closing_note)(onlooker)
+        if note is not None:
+            yield note
+    if (raised := contained.summary()) is not None:
+        yield raised
 
 
 class DriveRecorder:

@@ -20,9 +20,9 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
 from jaxnav.configuration import step_folder
 from jaxnav.errors import BadInput, visible
-from jaxnav.files.ros import RosFile, load_ros
+from jaxnav.files.ros import load_ros
 from jaxnav.loop.signals import Signals
-from jaxnav.ros.connection import Connection, message_type
+from jaxnav.ros.connection import Connection
 
 _LOOK_S = 0.05
 _CLOCK_S = 10.0  # for the first message of /clock
@@ -76,14 +76,14 @@ class _Node:
         self._node: Any = self.connection.node
         given = self._node.declare_parameter("file", "").value
         self._file = str(args.file or given)
-        self._timer = self._node.create_timer(_LOOK_S, self._look)
-        for kind, name, answer in (
+        self.connection.every(_LOOK_S, "the end of the drive", self._look)
+        for kind, name, *answers in (
             ("std_srvs/srv/Trigger", "~/reset", self._reset),
-            ("jaxnav_msgs/srv/LoadMarkers", "~/load_markers", self._load_markers),
+            ("jaxnav_msgs/srv/LoadMarkers", "~/load_markers", self._take_markers, self._load),
             ("jaxnav_msgs/srv/Save", "~/save", self._save),
         ):
             with suppress(ImportError):  # our messages were not built, or older ones
-                self._node.create_service(message_type(kind), name, answer)
+                self.connection.serve(kind, name, *answers)
 
     def begin(self) -> None:
         """Configure and activate.
@@ -120,9 +120,7 @@ class _Node:
     def _configure(self) -> None:
         if not self._file:
             raise BadInput("file", "missing: the node's YAML file, as argument or as parameter")
-        self._prepare(load_ros(self._file))
-
-    def _prepare(self, file: RosFile) -> None:
+        file = load_ros(self._file)
         kind = PreparedBody if file.vehicle is None else PreparedDrive
         prepared = kind(self._args, file, self.connection, self._signals, self._say)
         if self._prepared is not None:
@@ -157,52 +155,57 @@ class _Node:
     def _look(self) -> None:
         """Leave the active state where the activity has ended by itself."""
         if self._activity is not None and self._activity.ended is not None:
-            why = self._activity.ended
-            self._say(f"ended: {why}")
+            self._end(self._activity.ended)
+
+    def _end(self, why: str) -> None:
+        self._say(f"ended: {why}")
+        try:
             self._node.trigger_deactivate()
+        finally:
             self.ended = why
+
+    def _begin(self, prepared: PreparedDrive | PreparedBody) -> None:
+        """Begin anew what was stopped; where that fails the node is not active any more."""
+        try:
+            self._activity = prepared.begin()
+        except Exception as error:
+            self._end(f"it could not begin anew: {error}")
+            raise
 
     def _reset(self, request: Any, response: Any) -> Any:
         """Begin anew: nothing is known of the pose."""
-        if self._activity is None:
-            response.success, response.message = False, "the node is not active"
-            return response
-        return self._anew("reset", lambda: None, response)
+        if self._activity is None or self._prepared is None:
+            raise BadInput("reset", "the node is not active")
+        self._stop("reset")
+        self._begin(self._prepared)
+        response.success, response.message = True, "reset"
+        return response
 
-    def _load_markers(self, request: Any, response: Any) -> Any:
-        """Take another map, and begin anew in it."""
+    def _load(self, request: Any) -> tuple[Any, Callable[[], None]]:
+        """Read another map and compile for it, beside the drive: a wrong one does not stop it."""
         prepared = self._prepared
         if prepared is None:
-            response.success, response.message = False, "the node is not configured"
-            return response
-        file = prepared.file.with_markers(str(request.path))
-        return self._anew("another map", lambda: self._prepare(file), response)
+            raise BadInput("load_markers", "the node is not configured")
+        return prepared, prepared.with_markers(str(request.path))
+
+    def _take_markers(self, request: Any, response: Any, loaded: Any) -> Any:
+        """Take the map that was loaded, and begin anew in it."""
+        prepared: PreparedDrive | PreparedBody = loaded[0]
+        if prepared is not self._prepared:
+            raise BadInput("load_markers", "the node was configured anew meanwhile")
+        active = self._activity is not None
+        self._stop("another map")
+        loaded[1]()
+        if active:
+            self._begin(prepared)
+        response.success, response.message = True, "another map"
+        return response
 
     def _save(self, request: Any, response: Any) -> Any:
         """Write what the drive has learnt into new files."""
-        try:
-            if self._activity is None:
-                raise BadInput("save", "the node is not active")
-            response.success, response.message = True, self._activity.save(str(request.folder))
-        except BadInput as error:
-            response.success, response.message = False, str(error)
-        return response
-
-    def _anew(self, why: str, change: Callable[[], None], response: Any) -> Any:
-        """Stop, change something, and go on if it was active before; what fails changes nothing."""
-        active = self._activity is not None
-        response.success, response.message = True, why
-        try:
-            if self._prepared is not None:
-                self._stop(why)
-                change()
-        except BadInput as error:
-            response.success, response.message = False, str(error)
-        try:
-            if active and self._prepared is not None:
-                self._activity = self._prepared.begin()
-        except BadInput as error:
-            response.success, response.message = False, str(error)
+        if self._activity is None:
+            raise BadInput("save", "the node is not active")
+        response.success, response.message = True, self._activity.save(str(request.folder))
         return response
 
     def _await_clock(self) -> None:

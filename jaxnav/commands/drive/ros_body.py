@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -27,8 +28,10 @@ from jaxnav.files.ros import RosFile
 from jaxnav.loop.interfaces import Camera, Setup
 from jaxnav.loop.seeing import Search
 from jaxnav.loop.signals import Signals
+from jaxnav.models.markers import MarkerMap
 from jaxnav.models.odometry_errors import OdometryErrors
-from jaxnav.navigator import Navigator
+from jaxnav.models.rig import CameraRig
+from jaxnav.navigator import Navigator, Step
 from jaxnav.ros.body import BodyTracker
 from jaxnav.ros.connection import Connection
 from jaxnav.ros.estimates import Report
@@ -60,7 +63,55 @@ class PreparedBody:
         for flag, given in (("--record", args.record), ("--bag", args.bag)):
             if given is not None:
                 raise BadInput(flag, "is for drives: the file names no vehicle")
+        self._args, self._say, self._connection = args, say, connection
         rig, markers = rig_for(file, signals), load_markers(path_of(file, "markers"))
+        connection.ros_time = True  # the same stamps give the same poses, whenever they come
+        self._navigator, self._step, self._searches = self._compiled(file, rig, markers)
+        odom, listening = odom_for(file, connection)
+        self._leave = partial(connection.forget, *listening)
+        self._publisher = publisher_for(file, connection, markers, odom)
+        nothing: Any = None
+        options = file.options(False, connection.sim_time) | {"stamps": "ros"}
+        self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
+
+    def with_markers(self, path: str) -> Callable[[], None]:
+        """See `PreparedDrive`."""
+        file, rig = self.file.with_markers(path), self._navigator.rig
+        markers = load_markers(path_of(file, "markers"))
+        compiled, setup = self._compiled(file, rig, markers), replace(self._setup, markers=markers)
+
+        def take() -> None:
+            self.file, self._setup = file, setup
+            self._navigator, self._step, self._searches = compiled
+            self._publisher.show_map(markers)
+
+        return take
+
+    def begin(self) -> Activity:
+        """Begin to track it, with nothing known."""
+        tracker = self._tracker(self._navigator, self._step, self._send)
+        ends: list[Any] = []
+        if self.file.odometry is not None:
+            clock = self._connection.source_clock()
+
+            def take(message: Any) -> None:
+                pose = pose_of(message.pose.pose.position, message.pose.pose.orientation)
+                if pose is not None:
+                    tracker.add_odometry(clock.time_ns(message.header.stamp), pose)
+
+            ends.append(self._connection.listen(NAV_ODOMETRY, self.file.odometry, take))
+        cameras = open_cameras(self._setup, None)
+        return _Tracking(tracker, cameras, self._searches, self._connection, ends)
+
+    def close(self) -> None:
+        """Leave the topics."""
+        self._publisher.close()
+        self._leave()
+
+    def _compiled(
+        self, file: RosFile, rig: CameraRig, markers: MarkerMap
+    ) -> tuple[Navigator, Step, list[Search]]:
+        """The navigator, its compiled step, and the searches, all of them warm."""
         navigator = Navigator(
             rig=rig,
             markers=markers,
@@ -70,47 +121,22 @@ class PreparedBody:
         )
         params = file.file("params")
         params_read = Params.of({}, "") if params is None else load_params(params)
-        self._navigator = apply_params(navigator, params_read)
-        self._searches = searches_for(args.corner_backend, rig, markers)
-        connection.ros_time = True  # the same stamps give the same poses, whenever they come
-        self._step = compiled_step(self._navigator, step_folder())
-        tracker = self._tracker(lambda report: None)
-        others = [search.warm_up for search in self._searches]
-        timed(say, lambda: [warm_up() for warm_up in (tracker.warm_up, *others)])
-        odom, listening = odom_for(file, connection)
-        self._leave = partial(connection.forget, *listening)
-        self._publisher = publisher_for(file, connection, markers, odom)
-        self._connection = connection
-        nothing: Any = None
-        options = file.options(False, connection.sim_time) | {"stamps": "ros"}
-        self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
+        navigator = apply_params(navigator, params_read)
+        step = compiled_step(navigator, step_folder())
+        searches = searches_for(self._args.corner_backend, rig, markers)
+        tracker = self._tracker(navigator, step, lambda report: None)
+        others = [search.warm_up for search in searches]
+        timed(self._say, lambda: [warm_up() for warm_up in (tracker.warm_up, *others)])
+        return navigator, step, searches
 
-    def begin(self) -> Activity:
-        """Begin to track it, with nothing known."""
-        tracker, leave = self._tracker(self._send), lambda: None
-        if self.file.odometry is not None:
-            clock = self._connection.source_clock()
-
-            def take(message: Any) -> None:
-                pose = pose_of(message.pose.pose.position, message.pose.pose.orientation)
-                if pose is not None:
-                    tracker.add_odometry(clock.time_ns(message.header.stamp), pose)
-
-            end = self._connection.listen(NAV_ODOMETRY, self.file.odometry, take)
-            leave = partial(self._connection.forget, end)
-        return _Tracking(tracker, open_cameras(self._setup, None), self._searches, leave)
-
-    def close(self) -> None:
-        """Leave the topics."""
-        self._publisher.close()
-        self._leave()
-
-    def _tracker(self, tell: Callable[[Report], None]) -> BodyTracker:
-        file = self.file
+    def _tracker(
+        self, navigator: Navigator, step: Step, tell: Callable[[Report], None]
+    ) -> BodyTracker:
+        file, contained = self.file, self._connection.contained
         track = None
         if file.odometry is not None:
             track = GrowingTrack(file.T_vehicle_sensor, file.odometry_delay_s)
-        return BodyTracker(self._navigator, self._step, len(file.cameras), tell, track)
+        return BodyTracker(navigator, step, len(file.cameras), tell, track, contained)
 
     def _send(self, report: Report) -> None:
         if report.decided:
@@ -135,13 +161,14 @@ class _Tracking:
         tracker: BodyTracker,
         cameras: Sequence[Camera],
         searches: Sequence[Search],
-        leave: Callable[[], None],
+        connection: Connection,
+        ends: Sequence[Any],
     ):
         """Args:
-        leave: called at the end.
+        ends: the topics to leave.
         """
         self._tracker, self._cameras, self._searches = tracker, cameras, searches
-        self._leave = leave
+        self._connection, self._ends = connection, ends
         self._over = threading.Event()
         tracker.start()
         self._threads = [
@@ -158,7 +185,7 @@ class _Tracking:
             camera.close()
         for thread in self._threads:
             thread.join(1.0)
-        self._leave()
+        self._connection.forget(*self._ends)
         self._tracker.close()
 
     def save(self, folder: str) -> str:
@@ -166,13 +193,17 @@ class _Tracking:
         raise BadInput("save", "a rig that moves freely learns nothing of its cameras")
 
     def _look(self, index: int) -> None:
-        try:
-            while not self._over.is_set():
-                frame = self._cameras[index].read(_LOOK_S)
-                if frame is None:
-                    continue
-                sighted = self._searches[index].look(frame, None)
-                if sighted.detections is not None:
-                    self._tracker.add(index, sighted.stamp_ns, sighted.detections)
-        except Exception as error:  # whatever it is, a camera that is not read any more is said
-            self.ended = f"camera {self._cameras[index].name}: {type(error).__name__}: {error}"
+        camera = self._cameras[index]
+        turn = self._connection.contained.of(f"camera {camera.name}", self._turn, self._rest)
+        while not self._over.is_set():
+            turn(index)
+
+    def _turn(self, index: int) -> None:
+        frame = self._cameras[index].read(_LOOK_S)
+        if frame is not None:
+            sighted = self._searches[index].look(frame, None)
+            if sighted.detections is not None:
+                self._tracker.add(index, sighted.stamp_ns, sighted.detections)
+
+    def _rest(self, problem: str, index: int) -> None:
+        self._over.wait(_LOOK_S)

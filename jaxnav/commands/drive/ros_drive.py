@@ -3,13 +3,14 @@
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros, Run
 from jaxnav.commands.drive.learnt_watch import ExposureWatch
-from jaxnav.commands.drive.observers import DriveRecorder
+from jaxnav.commands.drive.observers import DriveRecorder, closing_notes
 from jaxnav.commands.drive.ros_save import LearntKeeper
 from jaxnav.commands.drive.ros_setup import (
     Activity,
@@ -25,14 +26,16 @@ from jaxnav.commands.drive.ros_setup import (
 from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, searches_for
 from jaxnav.configuration import step_folder
 from jaxnav.datasets.ros_drives import read_ros_drive
-from jaxnav.errors import BadInput
+from jaxnav.errors import BadInput, Containment
 from jaxnav.files import Route, load_markers, load_params, load_route, load_vehicle
 from jaxnav.files.ros import RosFile
 from jaxnav.files.vehicles import may_resume
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.frames import FrameDetections
 from jaxnav.loop.interfaces import Frame, Setup
+from jaxnav.loop.loop import Fenced
 from jaxnav.loop.pilot import Input, Outcome, Pilot
+from jaxnav.loop.seeing import Search
 from jaxnav.loop.signals import Signals
 from jaxnav.recording.drive_replay import check_inputs
 from jaxnav.recording.drive_setup import DriveSetup
@@ -90,21 +93,45 @@ class PreparedDrive:
             float64=args.float64,
             headless=True,
         )
-        self._searches = searches_for(
-            args.corner_backend, setup.rig, setup.markers, args.detector == "follow"
-        )
-        others = [search.warm_up for search in self._searches]
-        others.append(LearntKeeper(file, setup).warm_up)
-        timed(say, lambda: compiled_pilot(self._run, setup, others))
+        self._searches, self._inputs = self._compiled(setup, file)
         odom: OdomFrame | None = None
         self._listening: list[Any] = []
-        self._inputs: Sequence[Input] | None = None
         if args.bag is not None:
-            self._inputs = _inputs_of(args.bag, file, setup, args.corner_backend)
             connection.ros_time = True  # the bag's
         else:
             odom, self._listening = odom_for(file, connection)
         self._publisher = publisher_for(file, connection, setup.markers, odom)
+
+    def with_markers(self, path: str) -> Callable[[], None]:
+        """Read another map and compile for it; return what takes it. Nothing changes until then.
+
+        Raises:
+            BadInput: the file is wrong, or does not fit the others.
+        """
+        file = self.file.with_markers(path)
+        setup = replace(self._setup, markers=load_markers(path_of(file, "markers")))
+        searches, inputs = self._compiled(setup, file)
+
+        def take() -> None:
+            self.file, self._setup, self._searches, self._inputs = file, setup, searches, inputs
+            self._publisher.show_map(setup.markers)
+
+        return take
+
+    def _compiled(
+        self, setup: DriveSetup, file: RosFile
+    ) -> tuple[list[Search], Sequence[Input] | None]:
+        """The searches of a setup whose programs are compiled, and the inputs of a bag."""
+        args = self._args
+        searches = searches_for(
+            args.corner_backend, setup.rig, setup.markers, args.detector == "follow"
+        )
+        others = [search.warm_up for search in searches]
+        others.append(LearntKeeper(file, setup).warm_up)
+        timed(self._say, lambda: compiled_pilot(self._run, setup, others))
+        if args.bag is None:
+            return searches, None
+        return searches, _inputs_of(args.bag, file, setup, args.corner_backend)
 
     def begin(self) -> Activity:
         """Begin a drive in which nothing is known."""
@@ -175,7 +202,8 @@ class _Driving:
             if self._drive.guard is not None:
                 self._drive.guard.trip(reason)
             self._thread.join(_LOOK_S)
-        _close(self._observers, self._say)
+        loop = getattr(self._drive, "loop", None)  # a drive that could not begin has none
+        _close(self._observers, Containment() if loop is None else loop.contained, self._say)
         if self._drive.heard is not None:
             self._say(self._drive.heard)
 
@@ -183,7 +211,7 @@ class _Driving:
         try:
             self.ended = self._run()
         except BaseException as error:  # a plug-in's, or a signal: the node says so and rests
-            self.ended = str(error) or type(error).__name__
+            self.ended = _named(error)
 
 
 class _Playing:
@@ -205,6 +233,7 @@ class _Playing:
         self.ended: str | None = None
         self.save = keeper.save
         self._inputs, self._pilot, self._observers = inputs, pilot, observers
+        self._contained = Containment()
         self._connection, self._rate, self._say = connection, rate, say
         self._clock = connection.publisher(_CLOCK, "/clock")
         self._over = threading.Event()
@@ -215,10 +244,17 @@ class _Playing:
         """See `Activity`."""
         self._over.set()
         self._thread.join()
-        _close(self._observers, self._say)
+        _close(self._observers, self._contained, self._say)
         self._connection.forget(self._clock)
 
     def _play(self) -> None:
+        try:
+            self._plays()
+        except Exception as error:
+            self.ended = _named(error)
+
+    def _plays(self) -> None:
+        observers = [Fenced(observer, self._contained) for observer in self._observers]
         begin_s, first_ns = time.monotonic(), self._inputs[0].now_ns
         for given in self._inputs:
             due_s = begin_s + (given.now_ns - first_ns) / 1e9 / self._rate
@@ -227,7 +263,7 @@ class _Playing:
             clock = message_type(_CLOCK)(clock=self._connection.stamp(given.now_ns))
             self._connection.publish(self._clock, clock)
             outcome = self._pilot.handle(given)
-            for observer in self._observers:
+            for observer in observers:
                 observer.on_outcome(given, outcome)
         self.ended = OVER
 
@@ -269,10 +305,17 @@ def _inputs_of(bag: Path, file: RosFile, setup: DriveSetup, corner_backend: str)
     return inputs
 
 
-def _close(observers: list[Any], say: Say) -> None:
+def _close(observers: list[Any], contained: Containment, say: Say) -> None:
     """Close observers, and say what they sum up; those that are closed already are gone."""
-    while observers:
-        observer = observers.pop()
-        observer.close()
-        if observer.closing_note is not None:
-            say(observer.closing_note)
+    for observer in observers:
+        contained.of(f"{type(observer).__name__}.close", observer.close)()
+    for note in closing_notes(observers, contained):
+        say(note)
+    observers.clear()
+    contained.counts.clear()
+
+
+def _named(error: BaseException) -> str:
+    """What ended a drive: a person's mistake or a signal as they are, all else with its kind."""
+    known = isinstance(error, BadInput) or not isinstance(error, Exception)
+    return str(error) if known and str(error) else f"{type(error).__name__}: {error}"

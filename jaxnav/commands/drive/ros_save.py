@@ -72,7 +72,10 @@ class LearntKeeper:
         known, target = self._known, self._file.path.parent / folder
         if known is None:
             raise BadInput(_WHERE, NEVER_SURE)
-        if not folder or not target.is_dir():
+        is_there = False
+        with suppress(OSError):  # a name that is too long, say
+            is_there = bool(folder) and target.is_dir()
+        if not is_there:
             raise BadInput(_WHERE, f"there is no folder {target if folder else repr(folder)}")
         learnt, texts = self._adopted(known)
         for name in texts:

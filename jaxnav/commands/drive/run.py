@@ -20,7 +20,7 @@ import numpy as np
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.learnt_watch import ExposureWatch
-from jaxnav.commands.drive.observers import open_onlookers
+from jaxnav.commands.drive.observers import closing_notes, open_onlookers
 from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.compiling.executables import keep_in
@@ -100,9 +100,8 @@ def run(args: Run, signals: Signals) -> int:
                 sys.stderr.write(f"{visible(drive.heard)}\n")
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
-    for onlooker in onlookers:
-        if onlooker.closing_note is not None:
-            print(onlooker.closing_note)
+    for note in closing_notes(onlookers, drive.loop.contained):
+        print(note)
     return EXIT_STOPPED if drive.loop.stopped or drive.heard is not None else 0
 
 
