@@ -119,7 +119,7 @@ class Guard:
         threads and of the commands; None while nothing has to come in time."""
         if not self._armed:
             return None
-        return min(self._written_ns, *(beat_ns for beat_ns, _ in list(self._beats.values())))
+        return min([self._written_ns, *(beat_ns for beat_ns, _ in list(self._beats.values()))])
 
     def leave(self, name: str) -> None:
         """Stop watching a thread that ends normally."""

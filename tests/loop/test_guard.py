@@ -352,7 +352,6 @@ import math, signal, sys, threading, time
 sys.path.insert(0, {root!r})
 from jaxnav.loop.guard import Guard
 from jaxnav.loop.limits import Limits
-from jaxnav.loop.standing_clock import WaitingClock
 from jaxnav.loop.signals import Signals
 
 class Car:

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
-from jaxnav.files import save_vehicle, write_params
-from jaxnav.loop.flags import Health
+from jaxnav.files import calib_dir, save_vehicle, write_params
+from jaxnav.loop.flags import Fault, Health
 from jaxnav.models.twist_base import TwistBase
 from jaxnav.recording.drive_log import read_drive
 from jaxnav.vehicles.world import SimWorld
@@ -269,6 +269,25 @@ def test_a_car_in_the_guards_process_stands_when_the_drive_is_killed(workplace, 
         drive.process.kill()
         assert drive.stands_after_s(killed_ns) < STOPS_S + SLACK_S
         assert drive.process.wait(10) == -signal.SIGKILL
+
+
+def test_a_car_whose_file_says_so_drives_on_after_its_drive_was_suspended(workplace, tmp_path):
+    vehicle = tmp_path / "vehicle.yaml"
+    vehicle.write_text((calib_dir() / "qcar" / "vehicle.yaml").read_text() + "resume: true\n")
+    with driving(workplace, tmp_path, moved=True, more=("--vehicle", str(vehicle))) as drive:
+        suspended_ns = time.monotonic_ns()
+        drive.process.send_signal(signal.SIGSTOP)
+        assert drive.stands_after_s(suspended_ns) < 3.0 + SLACK_S
+        drive.process.send_signal(signal.SIGCONT)
+        ended = drive.ended()
+    assert ended.code == 0
+    assert ended.out.startswith("ended: arrived\n")
+    assert "held: no fresh command for " in ended.err
+    assert "drives on: all was well for 2 s" in ended.err
+    log = read_drive(drive.record)
+    held = log.outcomes.faults & Fault.HELD != 0
+    assert held.any()
+    assert not log.outcomes.throttle[held].any()
 
 
 def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_path):
