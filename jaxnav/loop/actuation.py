@@ -111,8 +111,12 @@ class Actuation:
             follows.command(target, gap_s)
 
     def forget(self) -> None:
-        """The next fix follows from no earlier one: the filter has begun anew."""
+        """The next fix follows from no earlier one: anything may have happened."""
         self._last = None
+
+    def forget_place(self) -> None:
+        """The filter has restarted: the next place does not follow from the last one."""
+        self._placed_ns = -_GAP_NS
 
     def add_fix(self, now_ns: int, fix: Fix) -> None:
         """Hold the way since the last fix against the commands since then."""

@@ -303,6 +303,7 @@ class Pilot:
             self._left = self._known
             self._restarts_ns.append(now_ns)
             self._support.note_restart()
+            self._actuation.forget_place()
             if self._turns is not None:
                 self._turns.forget()
         if data is not None and data.corners_px is not None and not fused.refused:

@@ -79,7 +79,20 @@ def commands(chassis, rng):
         yield from [told] * 15
 
 
-def drive(chassis, seed, duration_s, acts=lambda command: command):
+def used(chassis, rng):
+    """A new one every second, in which each part is used: nothing shows of one that is not."""
+    while True:
+        if isinstance(chassis, CarChassis):
+            told = rng.choice([-1, 1]) * rng.uniform(0.2, 0.5), 0.05
+        elif chassis is OMNI:
+            along, aside = rng.permutation([rng.uniform(0.4, 0.5), rng.uniform(0.1, 0.2)])
+            told = rng.choice([-1, 1]) * along, rng.choice([-1, 1]) * aside, 0.0
+        else:
+            told = 0.4, 0.0, rng.choice([-1, 1]) * rng.uniform(0.5, 1.5)
+        yield from [told] * 30
+
+
+def drive(chassis, seed, duration_s, acts=lambda command: command, commands=commands):
     """The first fault and the way until then, and until it gives up."""
     rng = np.random.default_rng(seed)
     truth, actuation = Truth(chassis, rng, acts), Actuation(chassis)
@@ -98,7 +111,7 @@ def drive(chassis, seed, duration_s, acts=lambda command: command):
 
 @pytest.mark.parametrize("chassis", [CAR, OMNI, DIFFERENTIAL], ids=["car", "omni", "differential"])
 def test_nothing_that_a_sound_vehicle_does_is_a_contradiction(chassis):
-    assert [drive(chassis, seed, 15.0)[0] for seed in range(20)] == [Fault(0)] * 20
+    assert [drive(chassis, seed, 15.0)[0] for seed in range(10)] == [Fault(0)] * 10
 
 
 @pytest.mark.parametrize(
@@ -119,8 +132,8 @@ def test_nothing_that_a_sound_vehicle_does_is_a_contradiction(chassis):
     ],
 )
 def test_what_is_wired_wrongly_is_named_soon_and_stands(chassis, acts, fault):
-    for seed in range(20):
-        named, named_m, gave_up_m = drive(chassis, seed, 8.0, acts)
-        assert named & fault, seed
-        assert named_m < 1.0, seed
-        assert gave_up_m < 2.0, seed
+    for seed in range(10):
+        named, named_m, gave_up_m = drive(chassis, seed, 5.0, acts, used)
+        assert named & fault
+        assert named_m < 0.5
+        assert gave_up_m < 1.0
