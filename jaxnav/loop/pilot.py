@@ -198,7 +198,7 @@ class Pilot:
         self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
         self._support = Support(self._chassis, relocate)
         self._actuation = Actuation(self._chassis)
-        self._corridor = Corridor(navigator.controller.waypoints_m, leave_m)
+        self._corridor = Corridor(np.asarray(navigator.controller.waypoints_m), leave_m)
         self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
         self._sure = False  # whether the estimate may judge cameras

@@ -238,6 +238,8 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
     ill = after[(healths[after] < Health.OK) | (healths[after] > row.well)]
     well = after[after > ill.max(initial=-1)]  # all that follow the last ill one
     recovered_s = float(times_s[well[0]] - row.ends_s) if len(well) else math.inf
+    controller = pilot.navigator.controller
+    assert controller is not None  # a pilot has one
     result = Result(
         row,
         faults,
@@ -247,7 +249,7 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
         float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
         recovered_s,
         outcomes[-1].restarts,
-        ways_of(row, steps, chassis_of(pilot.navigator.controller.vehicle).lever_m),
+        ways_of(row, steps, chassis_of(controller.vehicle).lever_m),
         (),
     )
     return dataclasses.replace(result, broken=tuple(_broken(result, steps, pilot)))
