@@ -26,7 +26,7 @@ from jaxnav.loop.propulsion import Reach
 from jaxnav.loop.standstill import between
 from jaxnav.loop.ways import Fix
 
-_FORGETS_S = 2.0  # time constant: a way of one or two metres
+_FORGETS_S = 3.0  # time constant: a way of one or two metres
 _GAP_NS = 300_000_000  # after a longer one between two fixes the way between them is unknown
 _SIGMAS = 3.0
 _LEAP_RAD = 0.1  # from frame to frame no vehicle turns farther beyond what is commanded
