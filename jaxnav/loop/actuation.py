@@ -26,7 +26,7 @@ from jaxnav.loop.propulsion import Reach
 from jaxnav.loop.standstill import between
 from jaxnav.loop.ways import Fix
 
-_FORGETS_S = 2.0  # time constant: a way of one or two metres
+_FORGETS_S = 3.0  # time constant: a way of one or two metres
 _GAP_NS = 300_000_000  # after a longer one between two fixes the way between them is unknown
 _SIGMAS = 3.0
 _LEAP_RAD = 0.1  # from frame to frame no vehicle turns farther beyond what is commanded
@@ -94,6 +94,7 @@ class Actuation:
         self._chassis = chassis
         self._parts = [_Follows(part, Reach(part.lag_s, part.factor)) for part in chassis.parts]
         self._last: tuple[int, Fix] | None = None
+        self._placed_ns = 0  # when the place, and not the heading alone, was as in the last fix
 
     @property
     def faults(self) -> Fault:
@@ -110,12 +111,18 @@ class Actuation:
             follows.command(target, gap_s)
 
     def forget(self) -> None:
-        """The next fix follows from no earlier one: the filter has begun anew."""
+        """The next fix follows from no earlier one: anything may have happened."""
         self._last = None
+
+    def forget_place(self) -> None:
+        """The filter has restarted: the next place does not follow from the last one."""
+        self._placed_ns = -_GAP_NS
 
     def add_fix(self, now_ns: int, fix: Fix) -> None:
         """Hold the way since the last fix against the commands since then."""
         last, self._last = self._last, (now_ns, fix)
+        is_placed = now_ns - self._placed_ns <= _GAP_NS
+        self._placed_ns = now_ns
         if last is not None and 0 < now_ns - last[0] <= _GAP_NS:
             gap_s, before = (now_ns - last[0]) / 1e9, last[1]
             ahead_m, left_m, turn_rad = between(before[:3], fix[:3])
@@ -127,8 +134,9 @@ class Actuation:
             kept = math.exp(-gap_s / _FORGETS_S)
             for follows, seen in zip(self._parts, self._chassis.seen(moved), strict=True):
                 sigma = fix.sigma_rad if follows.part.turns else fix.sigma_m
-                follows.see(seen, (path_m, path_m), way_m, sigma, kept)
-        self._begin()
+                if is_placed or follows.part.turns:
+                    follows.see(seen, (path_m, path_m), way_m, sigma, kept)
+        self._begin(self._parts)
 
     def add_headings(self, now_ns: int, headings: Sequence[tuple[float, float]]) -> None:
         """Go on with a turn alone, while corners contradict the estimate: each pose that they may
@@ -151,15 +159,15 @@ class Actuation:
             return
         fix = before._replace(psi_rad=before.psi_rad + turn_rad, sigma_rad=sigma_rad)
         self._last = now_ns, fix
-        ways_m = drive.least, drive.most
+        ways_m = gap_s * drive.reach.least, gap_s * drive.reach.most
         way_m = max(map(abs, ways_m)) + self._chassis.lever_m * abs(turn_rad)
         kept = math.exp(-gap_s / _FORGETS_S)
         turn.see(turn_rad, ways_m, way_m, sigma_rad, kept)
-        self._begin()
+        self._begin([turn])
 
-    def _begin(self) -> None:
+    def _begin(self, parts: list[_Follows]) -> None:
         """Begin a new way from fix to fix."""
-        for follows in self._parts:
+        for follows in parts:
             follows.begin()
             way_m = follows.contradicted_m
             self.gives_up = self.gives_up or (way_m is not None and way_m > _GIVES_UP_M)

@@ -200,7 +200,7 @@ class Pilot:
         self._frozen = partial(self._standstill.is_frozen, due=self._due_px)
         self._support = Support(self._chassis, relocate)
         self._actuation = Actuation(self._chassis)
-        self._corridor = Corridor(navigator.controller.waypoints_m, leave_m)
+        self._corridor = Corridor(np.asarray(navigator.controller.waypoints_m), leave_m)
         self._marker_votes = MarkerVotes(navigator.markers.ids)
         self._camera_votes = CameraVotes(navigator)
         self._twins = Twins(navigator)
@@ -315,6 +315,7 @@ class Pilot:
             self._left = self._known
             self._restarts_ns.append(now_ns)
             self._support.note_restart()
+            self._actuation.forget_place()
             if self._turns is not None:
                 self._turns.forget()
         if data is not None and data.corners_px is not None and not fused.refused:

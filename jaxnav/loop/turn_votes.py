@@ -17,7 +17,7 @@ from jaxnav.loop.chassis import Chassis, Motion
 from jaxnav.loop.limits import Command
 from jaxnav.loop.propulsion import Reach
 
-# As where a command is held against corners: six degrees, a tenth of a rad for each metre of wheels
+# Six degrees, a tenth of a rad for each metre of wheels
 # that are 3 % apart, and what a turn's own gain may be off by (tracks slide).
 _MARGIN_RAD, _SLACK_RADPM, _SHARE = 0.1, 0.1, 0.15
 _FORGETS_S = 2.0

@@ -32,7 +32,7 @@ from jaxnav.models.twist_base import TwistBase
 from jaxnav.navigator import Navigator
 from jaxnav.testing.injections import between
 from jaxnav.testing.lockstep import BEGIN_NS, Change, Rates, Step, drive
-from jaxnav.vehicles.world import SimWorld
+from jaxnav.vehicles.world import SimWorld, WorldSettings
 
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
 ALL_CAMERAS = range(4)  # of the trial's rig
@@ -144,7 +144,9 @@ class Trial:
     markers: MarkerMap
     vehicle: Vehicle | TwistBase
     start_pose: tuple[float, float, float] = (2.0, -1.0, math.radians(125.0))
+    waypoints_m: tuple[tuple[float, float], ...] = WAYPOINTS_M
     seed: int = 0
+    settings: WorldSettings | None = None
     program: Callable[[Navigator], Program] | None = None  # see `Pilot`; by default by `jax.jit`
 
     @property
@@ -169,7 +171,15 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     program = trial.program and trial.program(strip_static(navigator))
     leave_m = route.leaves_at_m
     pilot = Pilot(navigator, program=program, relocate=row.relocate, leave_m=leave_m)
-    world = SimWorld(trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, seed=trial.seed)
+    world = SimWorld(
+        trial.rig,
+        markers,
+        trial.vehicle,
+        route.start_pose,
+        BEGIN_NS,
+        trial.settings,
+        trial.seed,
+    )
     delays = None
     if Fault.CAMERA_LATE in row.faults and isinstance(trial.vehicle, Vehicle):
         delays = CameraDelays(navigator.rig, markers, trial.vehicle)
@@ -184,11 +194,11 @@ def shift_origin(trial: Trial, shift_m: Origin) -> tuple[MarkerMap, Route]:
     The trial's own coordinates count from the origin of its map.
     """
     if shift_m == ZERO:
-        return trial.markers, Route(WAYPOINTS_M, _RADIUS_M, trial.start_pose)
+        return trial.markers, Route(trial.waypoints_m, _RADIUS_M, trial.start_pose)
     x_m, y_m, z_m = np.add(trial.markers.origin_m, shift_m).tolist()
     data = marker_data(dataclasses.replace(trial.markers, origin_m=(x_m, y_m, z_m)))
     markers = MarkerFile.model_validate(data).map()
-    waypoints_m = points_in_world(WAYPOINTS_M, (x_m, y_m, z_m))
+    waypoints_m = points_in_world(trial.waypoints_m, (x_m, y_m, z_m))
     start_pose = planar_in_world(trial.start_pose, (x_m, y_m, z_m))
     return markers, Route(waypoints_m, _RADIUS_M, start_pose).relative_to(markers.origin_m)
 
@@ -208,6 +218,8 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
     ill = after[(healths[after] < Health.OK) | (healths[after] > row.well)]
     well = after[after > ill.max(initial=-1)]  # all that follow the last ill one
     recovered_s = float(times_s[well[0]] - row.ends_s) if len(well) else math.inf
+    controller = pilot.navigator.controller
+    assert controller is not None  # a pilot has one
     result = Result(
         row,
         faults,
@@ -217,7 +229,7 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
         float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
         recovered_s,
         outcomes[-1].restarts,
-        ways_of(row, steps, chassis_of(pilot.navigator.controller.vehicle).lever_m),
+        ways_of(row, steps, chassis_of(controller.vehicle).lever_m),
         (),
     )
     return dataclasses.replace(result, broken=tuple(_broken(result, steps, pilot)))

@@ -79,6 +79,7 @@ routes = st.builds(
     st.lists(st.tuples(small, small), min_size=1, max_size=4).map(tuple),
     positive,
     st.tuples(small, small, small),
+    st.none() | positive,
 )
 sound = st.floats(1e-18, 1e9)
 parameters = st.fixed_dictionaries(

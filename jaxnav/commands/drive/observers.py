@@ -294,7 +294,20 @@ def notice(outcome: Outcome, before: Fault) -> str | None:
         commanded = "throttle" if outcome.twist is None else "command"
         reasons.append(f"no marker in view, and the odometer contradicts the {commanded}")
     if Fault.GYRO_INVALID in new:
-        reasons.append("the gyro's readings are not finite, at its limit or repeated: left out")
+        told = "not finite, at its limit, repeated or noise"
+        reasons.append(f"the gyro's readings are {told}: left out")
+    if Fault.GYRO_CONTRADICTED in new:
+        reasons.append("the gyro contradicts wheels and corners: left out")
+    parts = {
+        Fault.DRIVE_CONTRADICTED: "throttle" if outcome.twist is None else "ahead",
+        Fault.SIDEWAYS_CONTRADICTED: "to the left",
+        Fault.TURN_CONTRADICTED: "steering" if outcome.twist is None else "turn",
+    }
+    wrong = ", ".join(name for part, name in parts.items() if part in new)
+    if wrong:
+        reasons.append(f"it does not move as it is told ({wrong}): reversed, dead or miswired")
+    if Fault.LEFT_ROUTE in new:
+        reasons.append("farther from its route than leave_m: it stands")
     if Fault.GYRO_STALE in new and Fault.ODOMETRY_STALE not in outcome.faults:
         reasons.append("the gyro tells nothing: the drive goes on without it")
     if Fault.MARKER_OUTVOTED in new and outcome.outvoted:
