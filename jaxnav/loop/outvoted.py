@@ -4,6 +4,7 @@ import math
 from itertools import combinations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -73,7 +74,7 @@ def sighted_places(
     The two poses of a square differ in how it is turned, not in where it is.
     """
 
-    def one(camera: int, corners_px: Array, size_m: Array) -> Array:
+    def one(camera: Array, corners_px: Array, size_m: Array) -> Array:
         lens, T_camera_vehicle = jax.tree.map(
             lambda leaf: leaf[camera], (rig.cameras, rig.Ts_camera_vehicle)
         )
@@ -82,7 +83,7 @@ def sighted_places(
         return place_m
 
     each = jax.vmap(jax.vmap(one, (None, 0, 0)), (0, 0, None))
-    places_m: Array = each(np.arange(len(rig)), corners_px, size_m)
+    places_m: Array = each(jnp.arange(len(rig)), corners_px, size_m)
     return places_m
 
 
