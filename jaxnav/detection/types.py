@@ -76,14 +76,9 @@ class Detections:
 
 
 class Detector(Protocol):
-    """Finds the markers of one family in an image.
-
-    Attributes:
-        ids: of the markers whose corners matter; None: of all.
-    """
+    """Finds the markers of one family in an image."""
 
     family: str
-    ids: Collection[int] | None
 
     @property
     def ids(self) -> Collection[int] | None:
