@@ -147,5 +147,5 @@ def jaxnav(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]
         capture_output=True,
         text=True,
         check=False,
-        timeout=600,
+        timeout=1800,
     )
