@@ -258,6 +258,7 @@ class Ranges:
             return
         self.slope = slope = xr / xx
         noise = max(rr - slope * xr, 0.0) / (count - 2)
+        noise *= (1 + 4 / (count - 2)) ** 2  # three sigmas of Student's t: few looks tell it badly
         # An error that grows along the whole way, whose looks lie evenly on it.
         along = (_LENS * range_m) ** 2 + _JITTER_M**2
         self.sigma = sigma = math.sqrt(noise / xx + along * count / (12 * xx) + _WHEELS**2)

@@ -277,13 +277,14 @@ def _contradicted_files() -> list[FaultRow]:
     never = partial(lasting, health=(Health.INIT,) * 2, lied_m=0.0, named_m=0.01, drive_s=2.0)
     told = partial(
         lasting,
-        faults=Fault.FILES_CONTRADICTED,
+        # Where two cameras see the marker, they contradict each other first.
+        faults=Fault.FILES_CONTRADICTED | Fault.DUPLICATE_MARKER,
         health=(_SLOW, Health.STOP),
         error_m=np.inf,
-        lied_m=0.5,
-        drive_s=6.0,
+        drive_s=8.0,
     )
-    turned = partial(told, named_m=0.3, stood_m=1.2)
+    soon = partial(told, lied_m=0.6, named_m=0.6, stood_m=1.3)
+    turned = partial(told, lied_m=0.3, named_m=0.3, stood_m=1.3)
     return [
         never(
             "corners listed the other way round",
@@ -295,14 +296,12 @@ def _contradicted_files() -> list[FaultRow]:
             happens=_at(_FROM_THE_START, lambda world: world.copy_markers((2.0, -1.6, np.pi))),
             faults=Fault.DUPLICATE_MARKER,
         ),
+        *(soon(f"marker size x{by:g}", happens=larger(by)) for by in (2.0, 0.5)),
         *(
-            told(f"marker size x{by:g}", happens=larger(by), named_m=at_m, stood_m=at_m + 0.7)
-            for by, at_m in ((2.0, 0.5), (0.5, 0.5), (1.2, 1.5), (0.8, 1.5))
+            told(f"marker size x{by:g}", happens=larger(by), lied_m=1.0, named_m=1.5)
+            for by in (1.2, 0.8)
         ),
-        *(
-            told(f"focal length x{by:g}", telling=_focal(by), named_m=0.5, stood_m=1.2)
-            for by in (1.5, 0.7)
-        ),
+        *(soon(f"focal length x{by:g}", telling=_focal(by)) for by in (1.5, 0.7)),
         turned("front and rear camera swapped", telling=_swapped(2, 1, 0, 3)),
         turned(
             "rig turned by 180 deg",
