@@ -171,7 +171,7 @@ class Guard:
                 return False
             if isinstance(self._vehicle, Resuming) and not self._vehicle.resume():
                 return False
-            self.reason, self.late = None, False
+            self.reason, self.late, self._stopped_s = None, False, 0.0
             self._tripped.clear()
             self._written_ns, self._deadline_ns = now_ns, now_ns + self._timeout_ns
             self._armed = True

@@ -315,7 +315,8 @@ class MovedVehicle:
         """
         if self._closed:
             return
-        self._stop_s = self._stop_s or time.monotonic()
+        if self._stop_s is None:
+            self._stop_s, self._heard = time.monotonic(), False
         if self._dead:
             raise OSError(self._dead)
         with suppress(OSError):  # the process is ending: `_listen` sees to it
@@ -326,7 +327,7 @@ class MovedVehicle:
         with suppress(OSError):
             if not (self._dead or self._closed):
                 self._guarding.commands.tell(resume=True)
-                self._stop_s, self._heard = None, False
+                self._stop_s = self._reason = None  # an answer is due to the next stop
                 return True
         return False
 
