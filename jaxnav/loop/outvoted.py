@@ -107,6 +107,8 @@ class Twins:
         self._stamps_ns = np.full(shape, _LONG_AGO_NS)
         self._seen_m = np.zeros((*shape, 3))
         self._agreed = np.zeros(len(rig), bool)
+        # When the first camera's look last contradicted the second's before it.
+        self._after_ns = np.full((shape[0], *shape), _LONG_AGO_NS)
         self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
 
     def warm_up(self) -> None:
@@ -166,10 +168,24 @@ class Twins:
                 at_m = np.array([c * ahead_m + s * left_m, c * left_m - s * ahead_m, at_m[2]])
             places_m.append((camera, at_m))
         for (one, one_m), (other, other_m) in combinations(places_m, 2):
+            if stamp_ns not in self._stamps_ns[[one, other], marker]:
+                continue
             farther_m = max(np.linalg.norm(one_m), np.linalg.norm(other_m))
             if np.linalg.norm(one_m - other_m) <= _APART_M + _APART_SHARE * farther_m:
                 self._agreed[[one, other]] = True
                 self._votes[marker] = max(self._votes[marker] - 1, 0)
-            elif not (self._agreed[one] and self._agreed[other]):
+            elif not (self._agreed[one] and self._agreed[other]) and self._in_turn(
+                one, other, marker, stamp_ns
+            ):
                 self._votes[marker] = min(self._votes[marker] + 1, 2 * _LASTING)
                 self._last_ns[marker] = stamp_ns
+
+    def _in_turn(self, one: int, other: int, marker: int, stamp_ns: int) -> bool:
+        """Whether two looks that contradict each other are of one time, or follow others of these
+        cameras that did in the other order: a vehicle that was carried off makes one contradiction.
+        """
+        if self._stamps_ns[one, marker] == self._stamps_ns[other, marker]:
+            return True
+        newer, older = (one, other) if self._stamps_ns[one, marker] == stamp_ns else (other, one)
+        self._after_ns[newer, older, marker] = stamp_ns
+        return bool(stamp_ns - self._after_ns[older, newer, marker] < _TOGETHER_NS)
