@@ -91,8 +91,7 @@ class Twins:
     """A drive's watch for one id that two cameras see at contradicting places: a copy, a mirror.
 
     Nothing in such a frame says which is right, or whether a camera is not where its file says. So
-    the id is left out of all cameras. Two cameras that have agreed before are another matter: one
-    of them was knocked, which the estimate judges (see `CameraVotes`).
+    the id is left out of all cameras. Where a sure estimate does, it judges (see `CameraVotes`).
 
     Attributes:
         contradicted_ns: stamp of the last contradiction.
@@ -106,7 +105,6 @@ class Twins:
         self._corners_px = np.zeros((*shape, 4, 2), self._dtype)
         self._stamps_ns = np.full(shape, _LONG_AGO_NS)
         self._seen_m = np.zeros((*shape, 3))
-        self._agreed = np.zeros(len(rig), bool)
         # When the first camera's look last contradicted the second's before it.
         self._after_ns = np.full((shape[0], *shape), _LONG_AGO_NS)
         self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
@@ -125,11 +123,14 @@ class Twins:
         """Stamp of the last contradiction."""
         return int(self._last_ns.max())
 
-    def remove_twins(self, data: EventData, stamp_ns: int, way: Way) -> EventData | None:
+    def remove_twins(
+        self, data: EventData, stamp_ns: int, way: Way, judged: bool = False
+    ) -> EventData | None:
         """The data without ids at contradicting places; None where that leaves nothing.
 
         Args:
             way: of the vehicle by its odometer, which has moved between looks.
+            judged: a sure estimate judges contradictions.
         """
         assert data.corners_px is not None
         assert data.visible is not None
@@ -144,7 +145,7 @@ class Twins:
             places_m = sighted_places(self._rig, self._size_m, self._corners_px)
             self._seen_m = np.asarray(places_m, float)
             for marker in np.flatnonzero(shared).tolist():
-                self._compare(marker, np.flatnonzero(recent[:, marker]), stamp_ns, way)
+                self._compare(marker, np.flatnonzero(recent[:, marker]), stamp_ns, way, judged)
         twins = (self._votes >= _LASTING) | (np.abs(stamp_ns - self._last_ns) < _TOGETHER_NS)
         return data.hiding(np.broadcast_to(twins, visible.shape)) if twins.any() else data
 
@@ -153,7 +154,9 @@ class Twins:
         place_m: list[float] = self._seen_m[camera, marker].tolist()
         return place_m
 
-    def _compare(self, marker: int, cameras: np.ndarray, stamp_ns: int, way: Way) -> None:
+    def _compare(
+        self, marker: int, cameras: np.ndarray, stamp_ns: int, way: Way, judged: bool
+    ) -> None:
         now = way.at(stamp_ns)
         places_m: list[tuple[int, np.ndarray]] = []
         for camera in cameras.tolist():
@@ -172,11 +175,8 @@ class Twins:
                 continue
             farther_m = max(np.linalg.norm(one_m), np.linalg.norm(other_m))
             if np.linalg.norm(one_m - other_m) <= _APART_M + _APART_SHARE * farther_m:
-                self._agreed[[one, other]] = True
                 self._votes[marker] = max(self._votes[marker] - 1, 0)
-            elif not (self._agreed[one] and self._agreed[other]) and self._in_turn(
-                one, other, marker, stamp_ns
-            ):
+            elif not judged and self._in_turn(one, other, marker, stamp_ns):
                 self._votes[marker] = min(self._votes[marker] + 1, 2 * _LASTING)
                 self._last_ns[marker] = stamp_ns
 

@@ -240,7 +240,9 @@ class Pilot:
             self._judge_cameras(data, stamp_ns)
             data = self._camera_votes.remove_outvoted(data)
         if data is not None:
-            data = self._twins.remove_twins(data, stamp_ns, self._standstill.way)
+            # By an estimate that has agreed with a way a knocked camera is told from a copy.
+            judged = self._sure and self._support.ranges.agreed
+            data = self._twins.remove_twins(data, stamp_ns, self._standstill.way, judged)
         if self._twins.seen(now_ns):
             faults |= Fault.DUPLICATE_MARKER
         if data is not None:

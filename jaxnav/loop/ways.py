@@ -216,6 +216,11 @@ class Ranges:
         """See the class."""
         return self.contradicted and self._since_m > _LASTING_M
 
+    @property
+    def agreed(self) -> bool:
+        """Whether a camera and a marker have agreed with the way."""
+        return bool(self._true)
+
     def add_place(
         self,
         lane: tuple[int, int],

@@ -63,7 +63,7 @@ class FaultRow:
         begins_s, ends_s: of the fault; inf: it lasts.
         always: the data are changed before `begins_s` too.
         drive_s: duration of the whole drive.
-        telling: makes the rig of the navigator's file from the true one.
+        telling, mapped: make the rig and the map of the navigator's files from the true ones.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
@@ -87,6 +87,7 @@ class FaultRow:
     drive_s: float = 7.0
     rates: Rates = field(default_factory=Rates)
     telling: Callable[[CameraRig], CameraRig] = lambda rig: rig
+    mapped: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     relocate: bool = True
     well: Health = Health.OK
@@ -163,7 +164,7 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     markers, route = shift_origin(trial, row.shift_m)
     navigator = Navigator(
         rig=row.telling(trial.rig),
-        markers=markers,
+        markers=row.mapped(markers),
         vehicle=trial.vehicle,
         waypoints_m=route.waypoints_m,
         waypoint_radius_m=route.waypoint_radius_m,

@@ -269,9 +269,8 @@ _FROM_THE_START = range(BEGIN_NS, BEGIN_NS + 1)
 def _contradicted_files() -> list[FaultRow]:
     """Rows in which a file, or a copy, contradicts what the vehicle sees from the start."""
 
-    def larger(by: float) -> Callable[[], Happens]:
-        none_m = (0.0, 0.0, 0.0)
-        return _at(_FROM_THE_START, lambda world: world.move_markers(none_m, scale=1 / by))
+    def sized(by: float) -> Callable[[MarkerMap], MarkerMap]:
+        return lambda markers: eqx.tree_at(lambda m: m.size_m, markers, by * markers.size_m)
 
     lasting = partial(FaultRow, begins_s=0.0, ends_s=_LATEST, bases=BASES[:2])
     never = partial(lasting, health=(Health.INIT,) * 2, lied_m=0.0, named_m=0.01, drive_s=2.0)
@@ -283,8 +282,8 @@ def _contradicted_files() -> list[FaultRow]:
         error_m=np.inf,
         drive_s=8.0,
     )
-    soon = partial(told, lied_m=0.6, named_m=0.6, stood_m=1.3)
-    turned = partial(told, lied_m=0.3, named_m=0.3, stood_m=1.3)
+    soon = partial(told, lied_m=0.6, named_m=0.6, stood_m=1.5)
+    turned = partial(told, lied_m=0.3, named_m=0.8, stood_m=1.3)  # a base turns on the spot first
     return [
         never(
             "corners listed the other way round",
@@ -296,9 +295,9 @@ def _contradicted_files() -> list[FaultRow]:
             happens=_at(_FROM_THE_START, lambda world: world.copy_markers((2.0, -1.6, np.pi))),
             faults=Fault.DUPLICATE_MARKER,
         ),
-        *(soon(f"marker size x{by:g}", happens=larger(by)) for by in (2.0, 0.5)),
+        *(soon(f"marker size x{by:g}", mapped=sized(by)) for by in (2.0, 0.5)),
         *(
-            told(f"marker size x{by:g}", happens=larger(by), lied_m=1.0, named_m=1.5)
+            told(f"marker size x{by:g}", mapped=sized(by), lied_m=1.0, named_m=1.5)
             for by in (1.2, 0.8)
         ),
         *(soon(f"focal length x{by:g}", telling=_focal(by)) for by in (1.5, 0.7)),

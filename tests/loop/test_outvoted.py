@@ -186,13 +186,8 @@ def test_what_calibration_and_noise_allow_is_one_place(noise_px):
     assert seen > 200
 
 
-def test_a_camera_that_agreed_before_was_knocked_and_is_no_copy():
-    watch, way = twins(), standing(40 * MS)
-    watch.remove_twins(views(worlds.OVERLAP_VIEW), 0, way)
-    both = views(worlds.OVERLAP_VIEW)
-    assert both.visible[:, 0].tolist() == [True, False, False, True]
-    turned = both.corners_px.copy()
-    turned[3, :, :, 0] -= 200.0
-    told = dataclasses.replace(both, corners_px=turned)
-    assert watch.remove_twins(told, 20 * MS, way) is told
-    assert twins().remove_twins(told, 20 * MS, way) is None
+def test_what_a_sure_estimate_judges_is_left_to_it():
+    watch, way, both = twins(), standing(40 * MS), views(worlds.START_VIEW, of_copy=[2])
+    assert watch.remove_twins(both, 20 * MS, way, judged=True) is both
+    assert not watch.seen(20 * MS)
+    assert watch.remove_twins(both, 20 * MS, way) is None
