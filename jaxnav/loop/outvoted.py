@@ -21,6 +21,7 @@ _TOGETHER_NS = 500_000_000  # cameras that take turns look within this time
 # Two cameras may see a marker this share of its distance apart: 17 degrees, where the filter learns
 # of a camera that is off by 10, or a range that differs by 30 %; and cameras measured by hand.
 _APART_SHARE, _APART_M = 0.3, 0.05
+_SIGMAS = 3.0  # of the noise of both ranges beside it
 _LASTING = 5  # frames after which only cameras that agree give the id back: as `CameraVotes`
 _LONG_AGO_NS = -(1 << 62)
 
@@ -104,7 +105,7 @@ class Twins:
         self._dtype = np.asarray(navigator.corner_sigma_px).dtype
         self._corners_px = np.zeros((*shape, 4, 2), self._dtype)
         self._stamps_ns = np.full(shape, _LONG_AGO_NS)
-        self._seen_m = np.zeros((*shape, 3))
+        self._sigma_px, self._seen_m = np.ones(shape), np.zeros((*shape, 3))
         # When the first camera's look last contradicted the second's before it.
         self._after_ns = np.full((shape[0], *shape), _LONG_AGO_NS)
         self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
@@ -137,7 +138,9 @@ class Twins:
         visible = data.visible
         if len(visible) < 2:
             return data
+        assert data.sigma_px is not None
         self._corners_px[visible] = data.corners_px[visible]
+        self._sigma_px[visible] = data.sigma_px[visible].max(axis=1)
         self._stamps_ns[visible] = stamp_ns
         recent = np.abs(stamp_ns - self._stamps_ns) < _TOGETHER_NS
         shared = visible.any(axis=0) & (recent.sum(axis=0) > 1)
@@ -158,6 +161,10 @@ class Twins:
         self, marker: int, cameras: np.ndarray, stamp_ns: int, way: Way, judged: bool
     ) -> None:
         now = way.at(stamp_ns)
+        # A range is as noisy as the longest side in the image.
+        corners_px = self._corners_px[:, marker]
+        sides_px = np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=1), axis=2).max(axis=1)
+        noise = self._sigma_px[:, marker] / np.maximum(sides_px, 1.0)
         places_m: list[tuple[int, np.ndarray]] = []
         for camera in cameras.tolist():
             then_ns, at_m = int(self._stamps_ns[camera, marker]), self._seen_m[camera, marker]
@@ -174,7 +181,8 @@ class Twins:
             if stamp_ns not in self._stamps_ns[[one, other], marker]:
                 continue
             farther_m = max(np.linalg.norm(one_m), np.linalg.norm(other_m))
-            if np.linalg.norm(one_m - other_m) <= _APART_M + _APART_SHARE * farther_m:
+            share = _APART_SHARE + _SIGMAS * float(np.linalg.norm(noise[[one, other]]))
+            if np.linalg.norm(one_m - other_m) <= _APART_M + share * farther_m:
                 self._votes[marker] = max(self._votes[marker] - 1, 0)
             elif not judged and self._in_turn(one, other, marker, stamp_ns):
                 self._votes[marker] = min(self._votes[marker] + 1, 2 * _LASTING)
