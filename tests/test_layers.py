@@ -51,7 +51,7 @@ SIDE_BY_SIDE = {
     "ros": {"detection", "files", "loop"},
     "datasets": {"detection", "files", "loop", "recording", "ros"},
     "vehicles": {"compiling", "detection", "files", "loop", "recording", "ros", "simulation"},
-    "testing": {"compiling", "detection", "files", "loop", "vehicles"},
+    "testing": {"compiling", "detection", "files", "loop", "simulation", "vehicles"},
     "calibration": {"detection", "files"},
     "studies": {"files", "simulation"},
     "tuning": {"simulation"},
