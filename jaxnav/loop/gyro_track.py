@@ -27,8 +27,8 @@ _MOST_RADPS = RANGES["turn_radps"].most
 _KEPT_NS = 1_500_000_000  # more than the age of the oldest event that is fused, see `stamps`
 STUCK_AFTER = 25  # readings to the last bit alike, other than zero: a sensor's noise is never so
 # White noise of as many, which a sensor of cars has fifty times less of, and the most that a single
-# reading counts for: one that is odd is not yet noise.
-_NOISE_RADPS, _MOST_BEND_RADPS = 0.3, 1.5
+# bend counts for: a single odd reading makes three, and is not yet noise.
+_NOISE_RADPS, _MOST_BEND_RADPS = 0.3, 0.8
 
 
 class _Sample(NamedTuple):

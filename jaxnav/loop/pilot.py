@@ -334,12 +334,13 @@ class Pilot:
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
         faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
         faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
-        sure = known.decided and self._support.confirmed and not doubts
         # A fix since then is by other ids.
         self._on_twins = self._twins.seen(now_ns) and (self._fix_ns or 0) < self._twins.last_ns
-        self._sure = sure and not self._on_twins
-        if self._drives and self._sure and self._corridor.is_left(known.pose[:2]):
-            faults |= Fault.LEFT_ROUTE
+        placed = known.decided and self._support.confirmed and not self._on_twins
+        self._sure = placed and not doubts
+        # Who was carried off is where it finds itself.
+        if self._drives and placed and not doubts & ~Fault.RELOCATED:
+            faults |= Fault.LEFT_ROUTE if self._corridor.is_left(known.pose[:2]) else _NO_FAULT
         output, known = self._honest(fused.output, known)
         if self._left is not None and output.decided:
             self._restart_reason += f"; {_apart(self._left.pose, known.pose)} away"
