@@ -29,7 +29,11 @@ def test_all_within_a_distance_of_a_leg_is_inside(place_m, is_left):
 
 def test_a_route_of_one_place_where_it_stands_is_a_circle():
     corridor = Corridor([(0.0, 0.0)], 1.0)
-    assert [corridor.is_left(np.array(at, float)) for at in ((0, 0), (0.9, 0), (0, 1.1))] == [0, 0, 1]
+    assert [corridor.is_left(np.array(at, float)) for at in ((0, 0), (0.9, 0), (0, 1.1))] == [
+        0,
+        0,
+        1,
+    ]
 
 
 def test_by_default_it_is_one_and_a_half_legs_and_a_metre(tmp_path):
