@@ -79,7 +79,7 @@ class GyroTrack:
             return Fault.STAMP_INVALID
         faults = Fault.CLOCK_JUMPED if self._stamps.jumps > jumps else Fault(0)
         self._newest_ns = stamp_ns
-        if not self._is_rate(reading.turn_radps):
+        if not self._is_rate(float(reading.turn_radps)):
             self._part += 1
             return faults | Fault.GYRO_INVALID
         last = self._samples[-1] if self._samples else None

@@ -199,7 +199,7 @@ def _odometry() -> list[FaultRow]:
         FaultRow(
             "odometry wraps around",
             _speed(wrapped),
-            rejects=Reject.ODOMETRY,
+            Fault.ODOMETRY_INVALID,
             ends_s=BEGIN_S + 0.03,
         ),
         off("NaN and inf in odometry", read(inject.not_finite), Fault.ODOMETRY_INVALID),

@@ -139,7 +139,7 @@ def late(by_s):
         (with_rate(math.nan), Fault.GYRO_INVALID | Fault.GYRO_STALE),
         (with_rate(-math.inf), Fault.GYRO_INVALID | Fault.GYRO_STALE),
         (with_rate(math.radians(2000.0)), Fault.GYRO_INVALID | Fault.GYRO_STALE),
-        (with_rate(0.25), Fault.GYRO_INVALID | Fault.GYRO_STALE),  # it repeats itself
+        (with_rate(-0.25), Fault.GYRO_INVALID | Fault.GYRO_STALE),  # it repeats itself
         (late(0.3), Fault.STAMP_INVALID | Fault.GYRO_STALE),
         (late(2.0), Fault.STAMP_INVALID | Fault.GYRO_STALE | Fault.CLOCK_JUMPED),
         (lambda one: [one, one], Fault.STAMP_INVALID),
