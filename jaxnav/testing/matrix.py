@@ -282,7 +282,7 @@ def _contradicted_files() -> list[FaultRow]:
         error_m=np.inf,
         drive_s=8.0,
     )
-    soon = partial(told, lied_m=0.6, named_m=0.6, stood_m=1.5)
+    soon = partial(told, lied_m=0.7, named_m=0.7, stood_m=1.5)
     turned = partial(told, lied_m=0.3, named_m=0.8, stood_m=1.3)  # a base turns on the spot first
     return [
         never(
@@ -638,7 +638,7 @@ def _gyros() -> list[FaultRow]:
         return FaultRow(
             name, dark, Fault.GYRO_CONTRADICTED | Fault.GYRO_INVALID,
             health=(Health.OK, Health.STOP), error_m=0.3,
-            begins_s=0.0, ends_s=_LATEST, bases=BASES[:2], gyro=True, lied_m=0.0, named_m=0.5,
+            begins_s=0.0, ends_s=_LATEST, bases=BASES[:2], gyro=True, lied_m=0.0, named_m=1.5,
             drive_s=12.0,
         )  # fmt: skip
 
