@@ -39,7 +39,7 @@ class Driven:
 
         Of health nothing is asked: a busy machine makes frames and readings stale.
         """
-        stamps_ns, true = np.array([w.stamp_ns for w in self.told]), [w.pose for w in self.told]
+        stamps_ns, true = np.array([w.clock_ns for w in self.told]), [w.pose for w in self.told]
         known = log.outcomes.located & log.outcomes.decided
         pose, at_ns = log.outcomes.pose[known], log.outcomes.now_ns[known]
         there = np.array(true)

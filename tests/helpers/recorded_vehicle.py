@@ -14,7 +14,8 @@ NAME = f"{__name__}:open_vehicle"
 
 
 class RecordedVehicle(sim.SimVehicle):
-    """Each line of the file: when, `time.monotonic_ns()`, what it was told, and its true pose."""
+    """Each line of the file: when, by `time.monotonic_ns()` and by its own clock, which waits for a
+    busy machine, what it was told, and its true pose."""
 
     def __init__(self, world: SimWorld, path: str):
         super().__init__(world)
@@ -29,10 +30,11 @@ class RecordedVehicle(sim.SimVehicle):
         self._tell(limits_of(self.world.vehicle).zero)
 
     def _tell(self, command: tuple[float, ...]) -> None:
-        now_ns = time.monotonic_ns()
-        numbers = [*command, *map(float, self.world.state(now_ns)[:3])]
+        clock_ns = self.waiting_clock.now_ns()
+        numbers = [*command, *map(float, self.world.state(clock_ns)[:3])]
         # One call, so that lines of several threads do not mix and outlive the process.
-        os.write(self._file, f"{now_ns} {' '.join(map(repr, numbers))}\n".encode())
+        line = f"{time.monotonic_ns()} {clock_ns} {' '.join(map(repr, numbers))}\n"
+        os.write(self._file, line.encode())
 
 
 def open_vehicle(setup: Setup) -> RecordedVehicle:
@@ -48,11 +50,13 @@ class Word:
     """What the vehicle was told.
 
     Attributes:
+        clock_ns: the time by the vehicle's own clock.
         throttle: of a car; of another base the largest part of its twist.
         pose: where it truly was, x_m, y_m, psi_rad.
     """
 
     stamp_ns: int
+    clock_ns: int
     throttle: float
     pose: tuple[float, ...] = ()
 
@@ -65,7 +69,7 @@ def words(path: Path) -> list[Word]:
     return [_word(*line.split()) for line in whole_lines]
 
 
-def _word(stamp: str, *numbers: str) -> Word:
+def _word(stamp: str, clock: str, *numbers: str) -> Word:
     *command, x_m, y_m, psi_rad = map(float, numbers)
     throttle = command[1] if len(command) == 2 else max(map(abs, command))
-    return Word(int(stamp), throttle, (x_m, y_m, psi_rad))
+    return Word(int(stamp), int(clock), throttle, (x_m, y_m, psi_rad))

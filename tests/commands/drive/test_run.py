@@ -96,7 +96,10 @@ class Running:
     def told(self) -> list[Word]:
         """What the vehicle was told so far, by whichever process."""
         if "plain_car" in str(self.process.args):
-            return [Word(word.stamp_ns, word.throttle) for word in plain_car.words(self.log)]
+            return [
+                Word(word.stamp_ns, word.stamp_ns, word.throttle)
+                for word in plain_car.words(self.log)
+            ]
         return words(self.log)
 
     def stands_after_s(self, since_ns: int) -> float:
