@@ -241,7 +241,6 @@ def test_its_map_is_checked_and_found(stranger, driven, here, tmp_path):
             ("base: must be ackermann here", "mast/lookout is the rig's only camera"),
         ),
         ("demo --rig RIG --markers MARKERS --vehicle VEHICLE", "base: must be ackermann here"),
-        ("faults --vehicle VEHICLE", "base: must be ackermann here"),
         ("simulate --rig RIG --markers MARKERS --vehicle VEHICLE", "--route: no marker of the map"),
         ("tune controller --rig RIG --markers MARKERS --vehicle VEHICLE", "--route: no marker"),
         ("tune filter --rig RIG --markers MARKERS --vehicle VEHICLE", "--route: no marker"),

@@ -33,7 +33,8 @@ class RecordedVehicle(sim.SimVehicle):
         clock_ns = self.waiting_clock.now_ns()
         numbers = [*command, *map(float, self.world.state(clock_ns)[:3])]
         # One call, so that lines of several threads do not mix and outlive the process.
-        line = f"{time.monotonic_ns()} {clock_ns} {' '.join(map(repr, numbers))}\n"
+        told = " ".join(f"{number:.7g}" for number in numbers)
+        line = f"{time.monotonic_ns()} {clock_ns} {told}\n"
         os.write(self._file, line.encode())
 
 

@@ -31,7 +31,7 @@ STOPS_S = 0.2  # after a signal, at the latest
 SLACK_S = 0.3  # of a machine that does something else
 REPLACED_S = 2.0  # after the end of a drive whose guard hangs
 START_S = 120.0  # until it drives: the first one compiles, on a machine that is busy
-LITTLE_BYTES = 12_000  # more than the vehicle is told in a drive, less than is recorded of one
+LITTLE_BYTES = 40_000  # more than the vehicle is told in a drive, less than is recorded of one
 ROUTE = """
 waypoints_m: [[0.0, 0.0]]
 waypoint_radius_m: 0.15
