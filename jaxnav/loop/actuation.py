@@ -17,12 +17,12 @@ wrong odometer is the same from fix to fix, so it does not show in the differenc
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from jaxnav.loop.chassis import Chassis, Motion, Part
 from jaxnav.loop.flags import Fault
 from jaxnav.loop.limits import Command
-from jaxnav.loop.propulsion import Reach
+from jaxnav.loop.propulsion import Apart, Reach
 from jaxnav.loop.standstill import between
 from jaxnav.loop.ways import Fix
 
@@ -44,8 +44,7 @@ class _Follows:
     reach: Reach
     least: float = 0.0  # due since the last fix; by way: the least and most curvature meanwhile
     most: float = 0.0
-    below: float = 0.0  # what was seen beyond the bounds, m or rad
-    above: float = 0.0
+    beyond: Apart = field(default_factory=Apart)  # what was seen beyond the bounds
     contradicted_m: float | None = None  # way since it is contradicted
 
     def command(self, target: float, gap_s: float) -> None:
@@ -70,10 +69,8 @@ class _Follows:
         if part.by_way:
             due = [path_m * bound for path_m in paths_m for bound in (least, most)]
             least, most = min(due), max(due)
-        slack = part.slack_per_m * way_m
-        self.below = max(0.0, kept * self.below + least - slack - seen)
-        self.above = max(0.0, kept * self.above + seen - most - slack)
-        beyond = max(self.below, self.above)
+        self.beyond.add(seen - most, seen - least, part.slack_per_m * way_m, kept)
+        beyond = self.beyond.most
         if self.contradicted_m is not None:
             self.contradicted_m += way_m
             if beyond < _CLEARS * part.margin:

@@ -1,6 +1,5 @@
 """Leave out markers that others contradict, and ids that cameras see at contradicting places."""
 
-import math
 from itertools import combinations
 
 import jax
@@ -172,10 +171,8 @@ class Twins:
                 then = way.at(then_ns)
                 if now is None or then is None:
                     continue
-                x_m, y_m, psi_rad = between(then, now)
-                c, s = math.cos(psi_rad), math.sin(psi_rad)
-                ahead_m, left_m = at_m[0] - x_m, at_m[1] - y_m
-                at_m = np.array([c * ahead_m + s * left_m, c * left_m - s * ahead_m, at_m[2]])
+                ahead_m, left_m, _ = between(between(then, now), (at_m[0], at_m[1], 0.0))
+                at_m = np.array([ahead_m, left_m, at_m[2]])
             places_m.append((camera, at_m))
         for (one, one_m), (other, other_m) in combinations(places_m, 2):
             if stamp_ns not in self._stamps_ns[[one, other], marker]:

@@ -40,6 +40,29 @@ class Reach:
 
 
 @dataclass
+class Apart:
+    """By how much two motions differ, m or rad, beyond what they may: summed, slowly forgotten."""
+
+    above: float = 0.0
+    below: float = 0.0
+
+    def add(self, least: float, most: float, allowed: float, kept: float) -> None:
+        """Take the bounds of a difference.
+
+        Args:
+            allowed: it may be off by this much.
+            kept: share of the sum that is not forgotten meanwhile.
+        """
+        self.above = max(0.0, kept * self.above + least - allowed)
+        self.below = max(0.0, kept * self.below - most - allowed)
+
+    @property
+    def most(self) -> float:
+        """Either way."""
+        return max(self.above, self.below)
+
+
+@dataclass
 class Propulsion:
     """The speed range of a driven part expected from its command, and the deviation from it.
 

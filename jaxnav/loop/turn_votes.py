@@ -11,37 +11,18 @@ the command does. What differs beyond the errors of all of them is summed and sl
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from jaxnav.loop.chassis import Chassis, Motion
 from jaxnav.loop.limits import Command
-from jaxnav.loop.propulsion import Reach
+from jaxnav.loop.propulsion import Apart, Reach
 
-# Six degrees, a tenth of a rad for each metre of wheels
-# that are 3 % apart, and what a turn's own gain may be off by (tracks slide).
+# Six degrees, a tenth of a rad for each metre of wheels that are 3 % apart, and what a turn's own
+# gain may be off by (tracks slide).
 _MARGIN_RAD, _SLACK_RADPM, _SHARE = 0.1, 0.1, 0.15
 _FORGETS_S = 2.0
 _SIGMAS = 3.0  # of the gyro's bias
 _GAP_NS = 300_000_000  # after a longer one nothing is compared
 _SEEN_NS = 300_000_000  # after a fix; then the command is the third
-
-
-@dataclass
-class _Apart:
-    """By how much two differ, rad, beyond what they may."""
-
-    above: float = 0.0
-    below: float = 0.0
-
-    def add(self, least: float, most: float, allowed: float, gap_s: float) -> None:
-        """Take the bounds of a difference."""
-        kept = math.exp(-gap_s / _FORGETS_S)
-        self.above = max(0.0, kept * self.above + least - allowed)
-        self.below = max(0.0, kept * self.below - most - allowed)
-
-    @property
-    def rad(self) -> float:
-        return max(self.above, self.below)
 
 
 class TurnVotes:
@@ -62,8 +43,8 @@ class TurnVotes:
         self._bias_radps = _SIGMAS * bias_sigma_radps
         self._part = chassis.parts[-1]
         self._reach = Reach(self._part.lag_s, self._part.factor)
-        self._gyro_wheels, self._gyro_corners, self._wheels_corners = _Apart(), _Apart(), _Apart()
-        self._gyro_command, self._wheels_command = _Apart(), _Apart()
+        self._gyro_wheels, self._gyro_corners, self._wheels_corners = Apart(), Apart(), Apart()
+        self._gyro_command, self._wheels_command = Apart(), Apart()
         self._reading: tuple[int, Motion] | None = None
         self._fix: tuple[int, float] | None = None
         self._wheels_rad = self._way_m = 0.0  # since the last fix
@@ -85,6 +66,7 @@ class TurnVotes:
         if not math.isfinite(gyro_rad):
             return
         share_rad = _SHARE * max(abs(turned_rad), abs(gyro_rad))
+        kept = math.exp(-gap_s / _FORGETS_S)
         slack_rad = _SLACK_RADPM * abs(way_m)
         bias_rad = self._bias_radps * gap_s
         per = way_m if self._part.by_way else gap_s
@@ -93,17 +75,17 @@ class TurnVotes:
             (self._gyro_command, gyro_rad, slack_rad + bias_rad),
             (self._wheels_command, turned_rad, slack_rad),
         ):
-            apart.add(rad - most, rad - least, slack, gap_s)
+            apart.add(rad - most, rad - least, slack, kept)
         off_rad = gyro_rad - turned_rad
-        self._gyro_wheels.add(off_rad, off_rad, share_rad + slack_rad + bias_rad, gap_s)
-        if self._gyro_wheels.rad > _MARGIN_RAD and not self.gyro_is_wrong:
+        self._gyro_wheels.add(off_rad, off_rad, share_rad + slack_rad + bias_rad, kept)
+        if self._gyro_wheels.most > _MARGIN_RAD and not self.gyro_is_wrong:
             seen = self._fix is not None and now_ns - self._fix[0] < _SEEN_NS
             gyro, wheels = (
                 (self._gyro_corners, self._wheels_corners)
                 if seen
                 else (self._gyro_command, self._wheels_command)
             )
-            self.gyro_is_wrong = gyro.rad > wheels.rad
+            self.gyro_is_wrong = gyro.most > wheels.most
 
     def add_fix(self, now_ns: int, psi_rad: float) -> None:
         """Hold the gyro and the wheels against a heading by the corners."""
@@ -116,11 +98,12 @@ class TurnVotes:
         turned_rad = math.remainder(psi_rad - last[1], math.tau)
         gyro_rad = self._mean_radps(last[0], now_ns) * gap_s
         slack_rad = _SHARE * abs(turned_rad)
+        kept = math.exp(-gap_s / _FORGETS_S)
         off_rad = wheels_rad - turned_rad
-        self._wheels_corners.add(off_rad, off_rad, slack_rad + _SLACK_RADPM * way_m, gap_s)
+        self._wheels_corners.add(off_rad, off_rad, slack_rad + _SLACK_RADPM * way_m, kept)
         if math.isfinite(gyro_rad):
             off_rad = gyro_rad - turned_rad
-            self._gyro_corners.add(off_rad, off_rad, slack_rad + self._bias_radps * gap_s, gap_s)
+            self._gyro_corners.add(off_rad, off_rad, slack_rad + self._bias_radps * gap_s, kept)
 
     def forget(self) -> None:
         """The next heading follows from no earlier one: the filter has begun anew."""

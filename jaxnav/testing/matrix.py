@@ -571,7 +571,6 @@ def _actuators() -> list[FaultRow]:
         tells: Callable[..., _Numbers],
         bases: tuple[str, ...],
     ) -> list[FaultRow]:
-        began = range(BEGIN_NS, BEGIN_NS + 1)
         return [
             driven(
                 f"{name}, true odometer",
@@ -584,7 +583,7 @@ def _actuators() -> list[FaultRow]:
             ),
             driven(
                 f"{name}, odometer as told, from the start",
-                happens=_at(began, lambda world: world.rewire(acts, tells)),
+                happens=_at(_FROM_THE_START, lambda world: world.rewire(acts, tells)),
                 faults=faults | Fault.RESTARTED_OFTEN,
                 begins_s=0.0,
                 bases=bases,

@@ -97,7 +97,7 @@ def run(args: Run, signals: Signals) -> int:
             reason = drive.run(pilot, searches, onlookers)
         finally:  # also of a drive that raises
             if drive.heard is not None:
-                sys.stderr.write(f"{visible(drive.heard)}\n")
+                _warn(drive.heard)
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
     for note in closing_notes(onlookers, drive.loop.contained):
@@ -290,7 +290,7 @@ class Drive:
 
 def _say(args: Run, text: str) -> None:
     if not args.headless:
-        sys.stderr.write(f"{visible(text)}\n")
+        _warn(text)
 
 
 def _warn(text: str) -> None:
