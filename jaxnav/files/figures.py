@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnav.files import poses
+from jaxnav.files.ranges import Range
 from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.models.lenses import LENSES
 from jaxnav.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Timing
@@ -100,7 +101,7 @@ def coefficients_problem(lens: str, coefficients: Sequence[float]) -> str | None
     kind = LENSES[lens]
     for name, value in zip(kind.coefficients, coefficients, strict=False):
         least, most = kind.within.get(name, (-math.inf, math.inf))
-        if not least <= value <= most:
+        if not Range(least, most, "", name).holds(value):
             allowed = f"from {least:g} to {most:g}" if most < math.inf else f"at least {least:g}"
             return f"{name} of the lens {lens} must be {allowed}, got {value:g}"
     return None
