@@ -32,7 +32,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxnav.models import bicycle
@@ -48,7 +47,7 @@ LEARNT = SLIP + 1  # the errors from here on are constant
 SENSORS_END = LEARNT + 4  # the errors of cameras come behind those of sensors
 _DELAY = SENSORS_END - 1
 MEMORY_S = 0.025  # T
-_PLANAR = np.array([0, 1, 5])  # of a twist: v_x, v_y, omega
+_PLANAR = (0, 1, 5)  # of a twist: v_x, v_y, omega
 # A reading beyond this, m/s or rad/s, is an error of the sensor or of its unit.
 _LARGEST_TWIST = 1e3
 
@@ -88,7 +87,8 @@ def velocity_of_twist(twist: Float[Array, " 6"] | None, mean: Float[Array, " n"]
         mean: (6,), or longer with the errors p behind.
     """
     dtype, errors = mean.dtype, mean[SIX:SENSORS_END]
-    read = jnp.full(3, jnp.nan, dtype) if twist is None else jnp.asarray(twist, dtype)[_PLANAR]
+    told = jnp.full(6, jnp.nan, dtype) if twist is None else jnp.asarray(twist, dtype)
+    read = jnp.stack([told[k] for k in _PLANAR])
     usable = jnp.abs(read) < _LARGEST_TWIST
     moves = usable[0] & usable[1]
     present = jnp.stack([moves, moves, usable[2]])

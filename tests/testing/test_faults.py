@@ -64,10 +64,10 @@ def trial(request) -> Iterator[Trial]:
         yield trial_of("ackermann", "none")
 
 
-@pytest.fixture(scope="module")
-def trials() -> Iterator[dict[str, Trial]]:
-    """Of every vehicle that has a gyro, in float64; the two bases have one compiled program."""
-    with jax.enable_x64(True):
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def trials(request) -> Iterator[dict[str, Trial]]:
+    """Of every vehicle that has a gyro; the two bases have one compiled program."""
+    with jax.enable_x64(request.param == "float64"):
         made = {base: trial_of(base, "consumer") for base in BASES}
         shared = made["differential"].program
         yield made | {"omni": dataclasses.replace(made["omni"], program=shared)}
