@@ -76,10 +76,12 @@ def test_the_current_folder_is_handed_on_only_where_it_was_asked_for(tmp_path):
 
     def handed_on(*folders):
         path = os.pathsep.join(map(str, (*folders, ROOT)))
-        environment = os.environ | {"PYTHONPATH": path}
+        environment = os.environ | {"PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
+        environment.pop("PYTHONSAFEPATH", None)  # with it the current folder is never on the path
         ended = subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True
         )
+        assert ended.returncode == 0, ended.stderr
         return ended.stdout.splitlines()
 
     assert str(tmp_path) not in handed_on()

@@ -164,10 +164,8 @@ def assemble(
         imu: on the vehicle.
 
     Raises:
-        BadInput: two families share an id in the map, the detections do not tell families; or
-            corners are in another order than they should be.
+        BadInput: two families share an id in the map, the detections do not tell families.
     """
-    check_winding(name, rows.corners_px[:, TO_OURS])
     if len(set(markers.ids)) < len(markers.ids):
         raise BadInput("--markers", "ids must differ: the recording does not tell families")
     stamps = np.unique(rows.frame_stamps_ns)

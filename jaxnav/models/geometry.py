@@ -20,6 +20,8 @@ OFF_GROUND = np.eye(6)[:, [2, 3, 4]]
 # Angles that differ by less are the same where one of two is chosen: a twentieth of what lies
 # between two candidates at least, and more than the rounding of an angle in float32, 3e-4.
 EVEN_RAD = 1e-3
+# And of four divisors, the largest of which is 1 or more, those that serve as well as the largest.
+EVEN_FOUR_SQUARES = 0.1
 _SKEW = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 1, 0).reshape(9, 3)
 
 
@@ -234,7 +236,7 @@ def rotation_from_matrix(R: Float[Array, "3 3"]) -> jaxlie.SO3:
             jnp.stack([m10 - m01, m02 + m20, m21 + m12, four_squares[3]]),
         ]
     )
-    row = rows[first_highest(four_squares, within=0.1)]
+    row = rows[first_highest(four_squares, EVEN_FOUR_SQUARES)]
     return jaxlie.SO3(row / jnp.sqrt(jnp.sum(row**2)))
 
 

@@ -14,6 +14,7 @@ a multiple of 4096 bytes apart evict each other from the first-level cache: so b
 lengths. `benchmarks/README-pose.md` has the figures.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -24,6 +25,7 @@ import jaxlie
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxnav.models.geometry import EVEN_FOUR_SQUARES
 from jaxnav.models.markers import CORNER_SIGNS
 from jaxnav.numerics.levenberg_marquardt import LanewiseSolver
 from jaxnav.pose.ippe import PosePair
@@ -162,14 +164,17 @@ def _quaternion(axis_x: list[Lane], axis_y: list[Lane]) -> tuple[Lane, Lane, Lan
         (m02 - m20, m10 + m01, 1 - m00 + m11 - m22, m21 + m12),
         (m10 - m01, m02 + m20, m21 + m12, 1 - m00 - m11 + m22),
     ]
-    best, (w, x, y, z) = rows[0][0], rows[0]
-    for k in (1, 2, 3):
-        better = rows[k][k] > best
-        best = jnp.where(better, rows[k][k], best)
-        w, x, y, z = (
-            jnp.where(better, new, old) for new, old in zip(rows[k], (w, x, y, z), strict=True)
+    four_squares = [rows[k][k] for k in range(4)]
+    enough = functools.reduce(jnp.maximum, four_squares) - EVEN_FOUR_SQUARES
+    chosen = *rows[3], four_squares[3]
+    for k in (2, 1, 0):
+        first = four_squares[k] >= enough
+        chosen = tuple(
+            jnp.where(first, new, old)
+            for new, old in zip((*rows[k], four_squares[k]), chosen, strict=True)
         )
-    length = 2 * jnp.sqrt(best)  # row i is 4 q_i q
+    w, x, y, z, square = chosen
+    length = 2 * jnp.sqrt(square)  # row i is 4 q_i q
     return w / length, x / length, y / length, z / length
 
 
