@@ -226,8 +226,11 @@ def test_its_map_is_checked_and_found(stranger, driven, here, tmp_path):
     assert (code, err) == (0, "")
     found = load_markers(tmp_path / "its map" / "markers.yaml")
     assert (found.ids, found.families) == (whole.ids, whole.families)
-    places_m = (one.Ts_world_marker.translation() for one in (found, whole))
-    assert np.linalg.norm(np.subtract(*map(np.asarray, places_m)), axis=1).max() < 0.05
+    off_m = np.subtract(*(one.Ts_world_marker.translation() for one in (found, whole)))
+    said = yaml.safe_load((tmp_path / "its map" / "markers.yaml").read_text())["markers"][1]
+    sigma_m = np.array(said["sigma"]["position_m"])
+    assert sigma_m.max() < 0.05
+    assert np.all(np.abs(off_m[1]) < 3 * sigma_m)
     assert drawn(tmp_path / "its map" / "report.png")
 
 
