@@ -13,11 +13,12 @@ ROS := .venv-ros
 ROS_SOURCES := $(shell find ros/environment ros/jaxnav_msgs -type f)
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-fast lint format benchmark fuzz docs ros test-ros clean
+.PHONY: help demo test test-all test-fast lint format benchmark fuzz docs ros test-ros clean
 
 help:
 	@echo "make demo       the main job: two simulated drives, their report in demo/"
-	@echo "make test       lint, types, tests"
+	@echo "make test       lint, types, tests, but for those that take longest"
+	@echo "make test-all   with those"
 	@echo "make test-fast  the core and most commands, some minutes: tests/fast.txt"
 	@echo "make lint       ruff and mypy alone"
 	@echo "make format     let ruff rewrite what it can"
@@ -33,6 +34,9 @@ demo: $(VENV)/.installed
 	@echo "for all other commands: . $(VENV)/bin/activate, or $(VENV)/bin/jaxnav --help"
 
 test: lint
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not long"
+
+test-all: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 test-fast: $(VENV)/.installed-dev

@@ -52,7 +52,9 @@ def run_banks_fast(monkeypatch):
     ("name", "frames", "selector", "median_m", "p95_m"),
     [
         ("test_5", 1200, "lowest-reprojection", 0.0029, 0.0125),  # of 2751
-        ("test_7", 454, "multi-hypothesis", 0.0015, 0.0041),  # all
+        pytest.param(
+            *("test_7", 454, "multi-hypothesis", 0.0015, 0.0041), marks=pytest.mark.long
+        ),  # all of it
     ],
 )
 def test_all_markers_locate_the_rig_to_millimetres(
@@ -89,6 +91,7 @@ def test_one_marker_at_a_time_takes_few_wrong_branches(test_7, alone):
     assert np.nanmedian(rotation_deg) < 0.52
 
 
+@pytest.mark.long
 def test_the_bank_halves_the_wrong_branches_and_smoothing_decides_the_others(
     test_7, alone, run_banks_fast
 ):
@@ -140,6 +143,7 @@ def test_frames_in_view_are_counted_from_every_appearance():
     assert frames_in_view(seen[:0]).shape == (0, 2)
 
 
+@pytest.mark.long
 def test_a_replay_is_the_step_over_and_over(test_7):
     # Not a whole number of chunks: padding must not show.
     short = test_7.first(CHUNK_FRAMES + 7)

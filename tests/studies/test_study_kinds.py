@@ -267,6 +267,7 @@ def finished(process: "subprocess.Popen[str]", code: int = 0) -> str:
     return out
 
 
+@pytest.mark.long
 def test_killed_continued_elsewhere_the_bits_stay_the_same(
     frames: tuple[xr.Dataset, xr.Dataset], tmp_path: Path
 ) -> None:

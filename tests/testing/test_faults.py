@@ -57,14 +57,17 @@ def trial_of(base: str, imu: str) -> Trial:
     return Trial(worlds.qcar_rig(), worlds.paper_markers(), vehicle, program=Compiled())
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
+BOTH = ["float64", pytest.param("float32", marks=pytest.mark.long)]
+
+
+@pytest.fixture(scope="module", params=BOTH)
 def trial(request) -> Iterator[Trial]:
     """Compiled once in each precision, in which all rows are then driven."""
     with jax.enable_x64(request.param == "float64"):
         yield trial_of("ackermann", "none")
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
+@pytest.fixture(scope="module", params=BOTH)
 def trials(request) -> Iterator[dict[str, Trial]]:
     """Of every vehicle that has a gyro; the two bases have one compiled program."""
     with jax.enable_x64(request.param == "float64"):

@@ -340,6 +340,7 @@ def test_a_filter_that_breaks_is_worth_nothing():
     np.testing.assert_array_equal(broken.square_m2[:DECIDES], 0)
 
 
+@pytest.mark.long
 def test_a_thousand_frames_need_little_memory():
     """What is carried from frame to frame, the bank, and what each search has found, which is less
     than half as much: without checkpoints it is 26 banks a frame."""
@@ -390,6 +391,7 @@ def test_gradients_are_finite(kind):
     assert np.any(slope != 0)
 
 
+@pytest.mark.long
 def test_the_implicit_gradient_is_that_of_all_steps():
     """Twenty steps of Gauss and Newton, each differentiated, against the minimum that moves."""
     pose, sigma_px = np.array([0.9, -0.6, 2.2]), 0.7

@@ -153,6 +153,7 @@ def test_derivatives_of_a_base_s_drive(left_limit_mps):
     assert without_gradient(slopes, space.labels) == idle
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_the_hard_drives_on_average(tame):
     """Over many seeds: differences of the loss as the car would drive, with the same seeds. The
     switch is a whole number of frames there, so the step is wide."""
@@ -212,6 +213,7 @@ def test_a_long_drive_needs_no_more_memory(tame):
     assert program.memory_analysis().temp_size_in_bytes < 2**20
 
 
+@pytest.mark.long
 def test_through_the_whole_navigator():
     """The filter and the fit to the corners included; straight before the marker and at rest, where
     angles and distances have no derivative, without noise as well."""
