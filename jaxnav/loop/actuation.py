@@ -29,6 +29,7 @@ from jaxnav.loop.ways import Fix
 _FORGETS_S = 3.0  # time constant: a way of one or two metres
 _GAP_NS = 300_000_000  # after a longer one between two fixes the way between them is unknown
 _SIGMAS = 3.0
+_ROUGH_RAD = 0.05  # headings less sure than this are those of a marker far off: noise
 _LEAP_RAD = 0.1  # from frame to frame no vehicle turns farther beyond what is commanded
 # Driven slowly while a part is contradicted, before the vehicle stands for good: half of the metre
 # after which it must stand is for the naming.
@@ -45,6 +46,7 @@ class _Follows:
     least: float = 0.0  # due since the last fix; by way: the least and most curvature meanwhile
     most: float = 0.0
     beyond: Apart = field(default_factory=Apart)  # what was seen beyond the bounds
+    sigma: float = 0.0  # the largest of those that were seen with, forgotten as `beyond` is
     contradicted_m: float | None = None  # way since it is contradicted
 
     def command(self, target: float, gap_s: float) -> None:
@@ -70,12 +72,13 @@ class _Follows:
             due = [path_m * bound for path_m in paths_m for bound in (least, most)]
             least, most = min(due), max(due)
         self.beyond.add(seen - most, seen - least, part.slack_per_m * way_m, kept)
+        self.sigma = max(kept * self.sigma, sigma)
         beyond = self.beyond.most
         if self.contradicted_m is not None:
             self.contradicted_m += way_m
             if beyond < _CLEARS * part.margin:
                 self.contradicted_m = None
-        elif beyond > part.margin + _SIGMAS * sigma:
+        elif beyond > part.margin + _SIGMAS * self.sigma:
             self.contradicted_m = 0.0
 
 
@@ -130,7 +133,8 @@ class Actuation:
             way_m = abs(path_m) + self._chassis.lever_m * abs(turn_rad)
             kept = math.exp(-gap_s / _FORGETS_S)
             for follows, seen in zip(self._parts, self._chassis.seen(moved), strict=True):
-                sigma = fix.sigma_rad if follows.part.turns else fix.sigma_m
+                turns = follows.part.turns
+                sigma = max((one.sigma_rad if turns else one.sigma_m) for one in (before, fix))
                 if is_placed or follows.part.turns:
                     follows.see(seen, (path_m, path_m), way_m, sigma, kept)
         self._begin(self._parts)
@@ -151,6 +155,8 @@ class Actuation:
         most_radps *= (
             max(map(abs, (drive.reach.least, drive.reach.most))) if turn.part.by_way else 1
         )
+        if sigma_rad > _ROUGH_RAD:
+            return
         if abs(turn_rad) > _LEAP_RAD + most_radps * gap_s:
             self._last = None  # carried off, or another pose of the marker
             return

@@ -19,6 +19,7 @@ from jaxnav.loop.propulsion import Apart, Reach
 # Six degrees, a tenth of a rad for each metre of wheels that are 3 % apart, and what a turn's own
 # gain may be off by (tracks slide).
 _MARGIN_RAD, _SLACK_RADPM, _SHARE = 0.1, 0.1, 0.15
+_CLEARLY = 2.0  # so much farther from the third than the wheels are
 _FORGETS_S = 2.0
 _SIGMAS = 3.0  # of the gyro's bias
 _GAP_NS = 300_000_000  # after a longer one nothing is compared
@@ -85,7 +86,7 @@ class TurnVotes:
                 if seen
                 else (self._gyro_command, self._wheels_command)
             )
-            self.gyro_is_wrong = gyro.most > wheels.most
+            self.gyro_is_wrong = gyro.most > max(_MARGIN_RAD / 2, _CLEARLY * wheels.most)
 
     def add_fix(self, now_ns: int, psi_rad: float) -> None:
         """Hold the gyro and the wheels against a heading by the corners."""
