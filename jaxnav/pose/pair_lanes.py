@@ -166,14 +166,13 @@ def _quaternion(axis_x: list[Lane], axis_y: list[Lane]) -> tuple[Lane, Lane, Lan
     ]
     four_squares = [rows[k][k] for k in range(4)]
     enough = functools.reduce(jnp.maximum, four_squares) - EVEN_FOUR_SQUARES
-    chosen = *rows[3], four_squares[3]
+    (w, x, y, z), square = rows[3], four_squares[3]
     for k in (2, 1, 0):
         first = four_squares[k] >= enough
-        chosen = tuple(
-            jnp.where(first, new, old)
-            for new, old in zip((*rows[k], four_squares[k]), chosen, strict=True)
+        square = jnp.where(first, four_squares[k], square)
+        w, x, y, z = (
+            jnp.where(first, new, old) for new, old in zip(rows[k], (w, x, y, z), strict=True)
         )
-    w, x, y, z, square = chosen
     length = 2 * jnp.sqrt(square)  # row i is 4 q_i q
     return w / length, x / length, y / length, z / length
 

@@ -143,3 +143,26 @@ def test_a_dead_servo_is_named_once_something_else_is_commanded(at_rad, within_m
         named, named_m, _ = drive(CAR, seed, 5.0, lambda c: (at_rad, c[1]), used)
         assert named == TURN
         assert named_m < within_m
+
+
+def test_headings_of_one_frame_that_are_unsure_turn_no_vehicle():
+    """As of a marker far off, while the estimate of a drive that has just begun is corrected."""
+    actuation = Actuation(CAR)
+    for index in range(30):
+        now_ns, psi_rad = index * PERIOD_NS, 0.01 * index
+        actuation.add_command((0.3, 0.05), PERIOD_NS / 1e9)
+        off_rad = {15: 0.1, 16: 0.2}.get(index)
+        if off_rad:
+            actuation.add_headings(now_ns, [(psi_rad + off_rad, 0.15)])
+        else:
+            actuation.add_fix(now_ns, Fix(0.02 * index, 0.0, psi_rad, 0.05, 0.02))
+    assert not actuation.faults
+
+
+def test_a_leap_of_what_was_hardly_known_is_no_motion():
+    actuation = Actuation(CAR)
+    for index in range(20):
+        psi_rad, sigma_rad = (0.2, 0.1) if index < 10 else (0.0, 0.02)
+        actuation.add_command((0.0, 0.05), PERIOD_NS / 1e9)
+        actuation.add_fix(index * PERIOD_NS, Fix(0.02 * index, 0.0, psi_rad, 0.05, sigma_rad))
+    assert not actuation.faults

@@ -74,3 +74,14 @@ def test_a_sound_gyro_is_never_named(chassis, turns):
 def test_one_that_lies_is_named(chassis, lie, dark):
     ways_m = [drive(chassis, seed, 10.0, lie, lambda s: dark) for seed in range(10)]
     assert max(ways_m) < (1.5 if dark else 1.0)
+
+
+def test_it_takes_more_than_a_little_to_blame_a_gyro():
+    """Blind, while the wheels count too much and the vehicle turns hardly less than it might."""
+    least = 1 / DIFFERENTIAL.parts[-1].factor
+    votes = TurnVotes(DIFFERENTIAL, BIAS_RADPS, lambda begin_ns, end_ns: 0.93 * least)
+    for index in range(40):
+        votes.add_command((0.0, 0.0, 1.0), PERIOD_NS / 1e9)
+        votes.add_reading(index * PERIOD_NS, Motion(0.0, 0.0, 1.3))
+    assert votes._gyro_wheels.most > 0.1
+    assert not votes.gyro_is_wrong
