@@ -215,7 +215,7 @@ def answer_of(listener: Listener, kind: str, name: str, values: dict):
     client = listener.connection.node.create_client(service, name)
     assert client.wait_for_service(10.0)
     answer = client.call_async(service.Request(**values))
-    until(answer.done, 120.0)
+    until(answer.done, 400.0)
     return answer.result()
 
 
