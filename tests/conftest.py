@@ -132,9 +132,10 @@ def stranger(
     return made
 
 
-@pytest.fixture(params=["float32", "float64"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.long)])
 def precision(request: pytest.FixtureRequest) -> Iterator[jnp.dtype]:
-    """The test runs once in each precision; JAX's default float is then this one."""
+    """The test runs once in each precision; JAX's default float is then this one. What vehicles
+    run is float32, and tests without this run in float64."""
     with jax.enable_x64(request.param == "float64"):
         yield jnp.dtype(request.param)
 

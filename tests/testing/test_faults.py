@@ -79,11 +79,17 @@ def trials(request) -> Iterator[dict[str, Trial]]:
 ROWS = matrix()
 CAR_ROWS = [row for row in ROWS if "ackermann" in row.bases and not row.gyro]
 OTHER_ROWS = [
-    (base, row)
+    pytest.param(
+        base,
+        row,
+        id=f"{row.name}-{base}",
+        # What the car shows as well is shown on others by `make test-all`.
+        marks=[pytest.mark.long] if base != "ackermann" and "ackermann" in row.bases else [],
+    )
     for row in ROWS
     for base in row.bases
     if row.gyro or base != "ackermann"
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("row", CAR_ROWS, ids=lambda row: row.name)
@@ -92,9 +98,7 @@ def test_every_fault_comes_to_what_it_must(trial, row):
     assert result.broken == (), line(result)
 
 
-@pytest.mark.parametrize(
-    ("base", "row"), OTHER_ROWS, ids=[f"{row.name}-{base}" for base, row in OTHER_ROWS]
-)
+@pytest.mark.parametrize(("base", "row"), OTHER_ROWS)
 def test_every_fault_of_other_vehicles_comes_to_what_it_must(trials, base, row):
     result = run_trial(row, trials[base])
     assert result.broken == (), line(result)
