@@ -148,7 +148,10 @@ class Connection:
 
     def every(self, period_s: float, name: str, function: Callable[[], None]) -> None:
         """Call a function again and again, in the thread of `run`."""
-        self.node.create_timer(period_s, self.contained.of(name, function))
+        contained = self.contained.of(name, function)
+        self.node.create_timer(
+            period_s, lambda: contained()
+        )  # one that takes more is told the time
 
     def serve(
         self,
