@@ -149,9 +149,7 @@ class Connection:
     def every(self, period_s: float, name: str, function: Callable[[], None]) -> None:
         """Call a function again and again, in the thread of `run`."""
         contained = self.contained.of(name, function)
-        self.node.create_timer(
-            period_s, lambda: contained()
-        )  # one that takes more is told the time
+        self.node.create_timer(period_s, lambda: contained())  # or it would be told the time
 
     def serve(
         self,
