@@ -76,10 +76,7 @@ def _serve(connection: Connection) -> None:
     )
     rng, times_s = np.random.default_rng(seed), track_times_s()
     while True:
-        try:
-            poses = connection.recv()
-        except (EOFError, OSError):
-            return
+        poses = connection.recv()
 
         def pose_at(at_s: np.ndarray, poses: np.ndarray = poses) -> np.ndarray:
             x_m, y_m, psi_rad = (np.interp(at_s, times_s, column) for column in poses.T)
@@ -91,4 +88,5 @@ def _serve(connection: Connection) -> None:
 
 
 if __name__ == "__main__":
-    _serve(Connection(int(sys.argv[1])))
+    with suppress(EOFError, OSError):  # who asked has gone
+        _serve(Connection(int(sys.argv[1])))
