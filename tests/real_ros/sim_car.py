@@ -68,6 +68,17 @@ class SimTime:
             time.sleep(0.005 if self.stands else left_ns / 1e9)
 
 
+class OwnClock:
+    """The clock of a world that other processes look at: it waits for nobody."""
+
+    def now_ns(self):
+        """The time of the world."""
+        return sim.time.monotonic_ns()
+
+    def wait_for(self, since_ns, ahead_s):
+        """See the class."""
+
+
 def topic_of(camera, what):
     """The topic of a camera, whose name may hold what that of a topic may not."""
     return f"/{camera.replace('-', '_')}/{what}"
@@ -110,6 +121,7 @@ def main(words):
         shown = {"images": "true", "rate_hz": "8"}
     setup = Setup(rig, markers, vehicle_model, route.start_pose, options=shown)
     vehicle = sim.open_vehicle(setup)
+    vehicle.waiting_clock = OwnClock()
     cameras = sim.open_cameras(setup, vehicle)
     ros_words = words.index("--ros-args") if "--ros-args" in words else len(words)
     ros = Connection("sim_car", args=words[ros_words:])
