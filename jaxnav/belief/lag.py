@@ -19,6 +19,7 @@ from jaxnav.belief.bank import Bank, heaviest
 from jaxnav.belief.estimate import Belief
 from jaxnav.belief.motion import Motion
 from jaxnav.belief.smoothing import Link
+from jaxnav.numerics.small_matrices import in_order
 from jaxnav.pose.observation import Observation
 
 # On the way back: observations passed, slot, time passed, mean and covariance there.
@@ -71,7 +72,7 @@ class Window(eqx.Module):
             obs: this one.
         """
         weight = jnp.where(before.initialised, before.log_weight, -jnp.inf)
-        slots = jax.lax.top_k(weight, self.slots.shape[1])[1].astype(self.slots.dtype)
+        slots = in_order(weight, self.slots.shape[1]).astype(self.slots.dtype)
         links = jax.vmap(lambda mean, P: Link.of(motion, (mean, P), obs))(
             before.mean[slots], before.covariance[slots]
         )

@@ -109,7 +109,7 @@ def find_candidates(
     count = min(max_candidates, owner_visible.shape[0])
     if count < owner_visible.shape[0]:
         first_guess = jnp.where(owner_visible, jax.vmap(joint_e1)(Ts_vehicle_world), jnp.inf)
-        _, best = jax.lax.top_k(-first_guess, count)
+        best = in_order(-first_guess, count)
         Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
         owner_visible = owner_visible[best]
 

@@ -136,7 +136,8 @@ def sightings(
     if kept < count:
         area = jnp.where(seen, quad_area(corners), -1)
         few = count <= _FEW_LANES
-        slots = in_order(area, kept) if few else jax.lax.top_k(area, kept)[1]
+        # Not `top_k`: it calls a library, and such programs can't be kept.
+        slots = in_order(area, kept) if few else jnp.argsort(area, descending=True)[:kept]
     else:
         slots = jnp.arange(count)
     camera_index, corners = camera_index[slots], corners[slots]

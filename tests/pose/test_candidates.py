@@ -11,6 +11,7 @@ import pytest
 import scipy.optimize
 
 from jaxnav.models.geometry import planar_from_T_world_vehicle
+from jaxnav.models.markers import MarkerMap
 from jaxnav.pose.candidates import Candidates, find_candidates
 from jaxnav.pose.observation import Observation, Snapshot
 from jaxnav.pose.residuals import e1
@@ -176,6 +177,21 @@ def test_pruning_keeps_what_explains_all_corners_best():
             jaxlie.SE3(every.T_vehicle_world.wxyz_xyz[0]).as_matrix(),
             atol=1e-6,
         )
+
+
+@pytest.mark.parametrize("copies", [1, 3], ids=["few lanes", "many"])
+def test_pruning_calls_no_library(copies):
+    """A program that does can't be kept, and is compiled anew at every start."""
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW)
+    many = jax.tree.map(
+        lambda leaf: jnp.concatenate([leaf] * copies), eqx.filter(markers, eqx.is_array)
+    )
+    names = markers.ids * copies, markers.families * copies
+    markers = MarkerMap(many.Ts_world_marker, many.size_m, *names)
+    wide = [jnp.concatenate([one] * copies, axis=1) for one in (obs.corners_px, obs.visible)]
+    obs = eqx.tree_at(lambda o: (o.corners_px, o.visible), obs, tuple(wide))
+    compiled = find.lower(rig, markers, obs).compile().as_text()
+    assert "custom_call_target" not in compiled
 
 
 def test_few_sightings_are_the_largest_ones():
