@@ -13,6 +13,7 @@ import math
 from collections import Counter
 
 import numpy as np
+from tqdm import tqdm
 
 from jaxnav.compiling.step import compile_or_load
 from jaxnav.configuration import configure, step_folder
@@ -73,7 +74,7 @@ def main() -> None:
     )
     if args.clean:
         told: Counter[str] = Counter()
-        for seed in range(args.clean):
+        for seed in tqdm(range(args.clean), mininterval=10):
             tunnel = inject.between(4.0, 7.0, TUNNEL) if seed % 2 else lambda given: [given]
             row = FaultRow("sound", lambda tunnel=tunnel: tunnel, begins_s=0.0, drive_s=12.0)
             result = run_trial(row, sound(trial, seed))
