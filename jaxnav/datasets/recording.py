@@ -148,6 +148,7 @@ class RecordingSource:
 
 
 def assemble(
+    path: Path,
     name: str,
     rows: Rows,
     rig: CameraRig,
@@ -159,13 +160,16 @@ def assemble(
     """Make a recording of a table of detections.
 
     Args:
+        path: named where the corners are wrong.
         poses: the reference, stamp in ns -> (7,) wxyz xyz of the vehicle in the world.
         odometry: of the vehicle, by other software.
         imu: on the vehicle.
 
     Raises:
-        BadInput: two families share an id in the map, the detections do not tell families.
+        BadInput: two families share an id in the map, the detections do not tell families; or
+            corners are in another order than they should be.
     """
+    check_winding(path, rows.corners_px[:, TO_OURS])
     if len(set(markers.ids)) < len(markers.ids):
         raise BadInput("--markers", "ids must differ: the recording does not tell families")
     stamps = np.unique(rows.frame_stamps_ns)

@@ -5,14 +5,7 @@ from typing import NoReturn
 
 from jaxnav.datasets import bags
 from jaxnav.datasets.decoded import read_decoded
-from jaxnav.datasets.recording import (
-    TO_OURS,
-    Recording,
-    RecordingSource,
-    Reference,
-    assemble,
-    check_winding,
-)
+from jaxnav.datasets.recording import Recording, RecordingSource, Reference, assemble
 from jaxnav.datasets.ros_rigs import read_ros_rig
 from jaxnav.datasets.tagslam import read_tagslam
 from jaxnav.errors import BadInput
@@ -49,8 +42,8 @@ def read_recording(
     if rig is not None and markers is None and bags.is_bag(path) and path.is_file():
         _no_markers(path)  # before all of it is read
     source = read_source(path, rig)
-    check_winding(path, source.rows.corners_px[:, TO_OURS])
     return assemble(
+        path,
         source.name,
         source.rows,
         source.rig,

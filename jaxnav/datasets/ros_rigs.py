@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.datasets.recording import TO_OURS, Recording, Rows, assemble, check_winding
+from jaxnav.datasets.recording import TO_OURS, Recording, Rows, assemble
 from jaxnav.datasets.ros_bags import one_line, read_messages
 from jaxnav.datasets.ros_drives import MessageReader
 from jaxnav.errors import BadInput
@@ -72,11 +72,10 @@ def read_ros_rig(
                 raise BadInput(path, problem) from None
     if imu is not None and len(stamps_ns) < 2:
         raise BadInput(at(topics.path, "imu"), f"{path} has {len(stamps_ns)} samples: 2 are needed")
-    rows = _rows(frames)
-    check_winding(path, rows.corners_px[:, TO_OURS])
     return assemble(
+        path,
         path.name,
-        rows,
+        _rows(frames),
         rig,
         markers,
         imu=None if imu is None else imu_messages.samples(imu, stamps_ns, readings),

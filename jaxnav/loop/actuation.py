@@ -135,7 +135,7 @@ class Actuation:
             for follows, seen in zip(self._parts, self._chassis.seen(moved), strict=True):
                 turns = follows.part.turns
                 sigma = max((one.sigma_rad if turns else one.sigma_m) for one in (before, fix))
-                if is_placed or follows.part.turns:
+                if is_placed or turns:
                     follows.see(seen, (path_m, path_m), way_m, sigma, kept)
         self._begin(self._parts)
 
@@ -151,12 +151,12 @@ class Actuation:
             (math.remainder(psi - before.psi_rad, math.tau), sigma) for psi, sigma in headings
         ]
         turn_rad, sigma_rad = min(turns_rad, key=lambda one: abs(one[0]), default=(math.inf, 0.0))
+        if sigma_rad > _ROUGH_RAD:
+            return
         most_radps = max(map(abs, (turn.reach.least, turn.reach.most)))
         most_radps *= (
             max(map(abs, (drive.reach.least, drive.reach.most))) if turn.part.by_way else 1
         )
-        if sigma_rad > _ROUGH_RAD:
-            return
         if abs(turn_rad) > _LEAP_RAD + most_radps * gap_s:
             self._last = None  # carried off, or another pose of the marker
             return

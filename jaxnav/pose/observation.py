@@ -22,8 +22,6 @@ MODEL_SIGMA_PX = 0.15
 # A reading beyond these is an error of the sensor or of its unit.
 _MAX_SPEED_MPS = 1e3
 _MAX_DT_S = 1e4
-# Up to here comparing every lane with every other is faster than a sort.
-_FEW_LANES = 32
 
 
 class Observation(eqx.Module):
@@ -135,9 +133,7 @@ def sightings(
     corners = jnp.where(seen[:, None, None], corners, centers[:, None] + dummy[None])
     if kept < count:
         area = jnp.where(seen, quad_area(corners), -1)
-        few = count <= _FEW_LANES
-        # Not `top_k`: it calls a library, and such programs can't be kept.
-        slots = in_order(area, kept) if few else jnp.argsort(area, descending=True)[:kept]
+        slots = in_order(area, kept)
     else:
         slots = jnp.arange(count)
     camera_index, corners = camera_index[slots], corners[slots]

@@ -106,7 +106,10 @@ def test_elimination_solves_for_all_right_sides_like_lapack(n):
     assert not np.all(np.isfinite(small.eliminate(jnp.zeros((n, n)), jnp.ones((n, 1)))))
 
 
-@pytest.mark.parametrize("values", [[3.0, 1.0, 2.0], [1.0, 1.0, 1.0], [-np.inf, 5.0, -np.inf, 5.0]])
+@pytest.mark.parametrize(
+    "values",
+    [[3.0, 1.0, 2.0], [1.0, 1.0, 1.0], [-np.inf, 5.0, -np.inf, 5.0], [-np.inf, 5.0, 1.0, 5.0] * 9],
+)
 def test_ranks_are_those_of_a_stable_sort(values):
     order = np.argsort(-np.asarray(values), kind="stable")
     np.testing.assert_array_equal(small.ranks(jnp.asarray(values))[order], np.arange(len(values)))

@@ -183,13 +183,14 @@ def test_pruning_keeps_what_explains_all_corners_best():
 def test_pruning_calls_no_library(copies):
     """As XLA's TopK: a program that does can't be kept, and is compiled anew at every start."""
     rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW)
-    many = jax.tree.map(
-        lambda leaf: jnp.concatenate([leaf] * copies), eqx.filter(markers, eqx.is_array)
+    markers = MarkerMap(
+        jaxlie.SE3(jnp.tile(markers.Ts_world_marker.wxyz_xyz, (copies, 1))),
+        jnp.tile(markers.size_m, copies),
+        markers.ids * copies,
+        markers.families * copies,
     )
-    names = markers.ids * copies, markers.families * copies
-    markers = MarkerMap(many.Ts_world_marker, many.size_m, *names)
-    wide = [jnp.concatenate([one] * copies, axis=1) for one in (obs.corners_px, obs.visible)]
-    obs = eqx.tree_at(lambda o: (o.corners_px, o.visible), obs, tuple(wide))
+    wide = jnp.tile(obs.corners_px, (1, copies, 1, 1)), jnp.tile(obs.visible, (1, copies))
+    obs = eqx.tree_at(lambda o: (o.corners_px, o.visible), obs, wide)
     assert " top_k[" not in str(jax.make_jaxpr(find)(rig, markers, obs))
 
 
