@@ -1,9 +1,10 @@
 """Does the car stop? Deaths of the process that computes, signals at any moment, guards that hang,
-long driving.
+robots that it has not seen before, long driving.
 
     python benchmarks/bench_stop.py deaths --each 50 --load 8
     python benchmarks/bench_stop.py signals --count 500
     python benchmarks/bench_stop.py hangs --each 50 --load 8
+    python benchmarks/bench_stop.py strangers --each 20 --jobs 4
     python benchmarks/bench_stop.py soak --minutes 60 --load 8
 
 `--load` adds so many processes that compute. How late a process wakes that only sleeps is measured
@@ -16,6 +17,7 @@ import json
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -37,11 +39,13 @@ sys.path.insert(0, str(ROOT))
 
 from jaxnav.loop.flags import Health  # noqa: E402
 from jaxnav.recording.drive_log import read_drive  # noqa: E402
-from tests.helpers import plain_cameras, plain_car, recorded_vehicle  # noqa: E402
+from tests.helpers import plain_cameras, plain_car, recorded_vehicle, strangers  # noqa: E402
 from tests.helpers.dying_parent import ENDS, ENDS_WELL  # noqa: E402
+from tests.helpers.late import MAIN as MAIN_LATE  # noqa: E402
 
 MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDINGS = [*(number.name for number in SIGNALS), "time is over", "arrived"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
@@ -255,22 +259,25 @@ def _signalled(
     return kind, phase, stood, process.returncode in expected, max(late_ms, 0.0), detail
 
 
-def hangs(each: int, jobs: int, processes: int, whole: bool) -> None:
+def hangs(each: int, jobs: int, processes: int, whole: bool, ends: list[str]) -> None:
     """A table: a guard that hangs, and up to a second later the drive ends. How long after that the
     vehicle stands, and whether that was said.
 
     Args:
-        whole: by `jaxnav run`; else by its signals, guard and vehicle alone, which is soon up.
+        whole: all by `jaxnav run`; else arrivals alone, the rest by its signals, guard and vehicle,
+            which are soon up.
     """
     rows: dict[tuple[str, str], list[float]] = {}
     missed, wrong, loads = 0, [], []
     with tempfile.TemporaryDirectory() as made, load(processes), ThreadPoolExecutor(jobs) as pool:
         folder = Path(made)
-        lasts_s = _drive_lasts_s(folder) if whole else 0.0
-        ends = [*(number.name for number in SIGNALS), "time is over", *["arrived"] * whole]
+        run = partial(_hung_run, lasts_s=_drive_lasts_s(folder))
         todo = [(how, end) for _ in range(each) for how in ("stopped", "held") for end in ends]
-        one = partial(_hung_run, lasts_s=lasts_s) if whole else _hung
-        results = pool.map(lambda job: one(folder / str(job[0]), *job[1]), enumerate(todo))
+
+        def one(number: int, how: str, end: str) -> tuple[float, str] | None:
+            return (run if whole or end == "arrived" else _hung)(folder / str(number), how, end)
+
+        results = pool.map(lambda job: one(job[0], *job[1]), enumerate(todo))
         with suppress(KeyboardInterrupt):  # what has come by then is told
             for key, result in zip(
                 todo, tqdm(results, total=len(todo), mininterval=30), strict=True
@@ -389,6 +396,62 @@ def _hung_run(folder: Path, how: str, end: str, lasts_s: float) -> tuple[float, 
     return _stood(log, due_ns, "" if said else f"{process.returncode} {err[-300:]}")
 
 
+def drive_strangers(each: int, jobs: int, processes: int) -> None:
+    """A table: robots that are not the QCar, driven by rendered images, with and without what an
+    earlier drive has compiled. Each must arrive, and nothing be compiled or loaded meanwhile."""
+    rows: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    wrong, loads = [], []
+    with tempfile.TemporaryDirectory() as made, load(processes), ThreadPoolExecutor(jobs) as pool:
+        robots = [strangers.crawler(Path(made)), strangers.slider(Path(made))]
+        todo = list(itertools.product(range(each), ("cold", "warm"), robots))
+        for robot in robots:  # what the warm ones load
+            _driven_by_images(0, "warm", robot)
+        results = pool.map(lambda job: _driven_by_images(*job), todo)
+        with suppress(KeyboardInterrupt):  # what has come by then is told
+            bar = tqdm(results, total=len(todo), mininterval=30)
+            for (_, kept, robot), (ended, wall_s, cpu_s) in zip(todo, bar, strict=True):
+                loads.append(os.getloadavg()[0])
+                key = robot.folder.name, kept
+                rows.setdefault(key, []).append((wall_s, cpu_s))
+                if ended != "0 ended: arrived":
+                    wrong.append((*key, ended))
+        pool.shutdown(cancel_futures=True)
+    print(f"load {np.median(loads):.1f}\n")
+    print("| robot | compiled | arrived, nothing late | s, median | CPU s, median |")
+    print("|---|---|---|---|---|")
+    for key, took in sorted(rows.items()):
+        bad = sum(one[:2] == key for one in wrong)
+        wall_s, cpu_s = np.median(took, axis=0)
+        print(
+            f"| {' | '.join(key)} | {len(took) - bad} of {len(took)} | {wall_s:.0f} | {cpu_s:.0f} |"
+        )
+    for row in wrong:
+        print(row)
+
+
+def _driven_by_images(
+    number: int, kept: str, robot: strangers.Stranger
+) -> tuple[str, float, float]:
+    """How it ended, and how long it took."""
+    begin_s = time.monotonic()
+    cache = robot.folder / (f"compiled {number}" if kept == "cold" else "compiled")
+    process = subprocess.Popen(
+        [sys.executable, "-c", MAIN_LATE, "run", *robot.flags(), "--car", "sim", "--option",
+         "images=true", "--headless", "--seed", str(number)],
+        cwd=robot.folder, env=ENVIRONMENT | {"JAX_COMPILATION_CACHE_DIR": str(cache)},
+        preexec_fn=_hear_signals, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    out = process.stdout.read()
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if kept == "cold":
+        shutil.rmtree(cache, ignore_errors=True)
+    first = next((line for line in out.splitlines() if line.startswith("ended: ")), out[-600:])
+    ended = f"{process.returncode} {first}"
+    return ended, time.monotonic() - begin_s, used.ru_utime + used.ru_stime
+
+
 def soak(minutes: float, processes: int) -> None:
     """Drives of the simulated car, one after the other, for so long: no stop that is not asked for,
     and every one that is. Beside each stop: how late others woke then that only sleep."""
@@ -468,21 +531,24 @@ def main() -> None:
     """What is asked for."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["deaths", "signals", "hangs", "soak"])
+    parser.add_argument("what", choices=["deaths", "signals", "hangs", "strangers", "soak"])
     parser.add_argument("--each", type=int, default=50)
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--load", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--whole", action="store_true", help="hangs: of `jaxnav run`")
+    parser.add_argument("--whole", action="store_true", help="hangs: all of `jaxnav run`")
+    parser.add_argument("--ends", nargs="+", choices=ENDINGS, default=ENDINGS, help="of hangs")
     args = parser.parse_args()
     if args.what == "deaths":
         deaths(args.each, args.jobs, args.load)
     elif args.what == "signals":
         signals(args.count, args.jobs, args.seed)
     elif args.what == "hangs":
-        hangs(args.each, args.jobs, args.load, args.whole)
+        hangs(args.each, args.jobs, args.load, args.whole, args.ends)
+    elif args.what == "strangers":
+        drive_strangers(args.each, args.jobs, args.load)
     else:
         soak(args.minutes, args.load)
 
