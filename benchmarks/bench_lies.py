@@ -1,4 +1,4 @@
-"""How far a vehicle goes on a lie about its motion, and how often a sound one is called a liar.
+"""How far a vehicle goes on a lie of its motion or its files; how often a sound one is blamed.
 
     python benchmarks/bench_lies.py [--base ackermann|differential|omni] [--imu NAME] [--seeds N]
     python benchmarks/bench_lies.py --clean N [--base ...]
@@ -30,6 +30,7 @@ from jaxnav.vehicles.world import WorldSettings
 LIES = (
     Fault.DRIVE_CONTRADICTED | Fault.SIDEWAYS_CONTRADICTED | Fault.TURN_CONTRADICTED
     | Fault.GYRO_CONTRADICTED | Fault.GYRO_INVALID | Fault.LEFT_ROUTE
+    | Fault.FILES_CONTRADICTED | Fault.DUPLICATE_MARKER | Fault.CORNERS_MIRRORED
 )  # fmt: skip
 TUNNEL = inject.frames(inject.nothing_seen)
 
