@@ -403,13 +403,13 @@ def drive_strangers(each: int, jobs: int, processes: int) -> None:
     wrong, loads = [], []
     with tempfile.TemporaryDirectory() as made, load(processes), ThreadPoolExecutor(jobs) as pool:
         robots = [strangers.crawler(Path(made)), strangers.slider(Path(made))]
-        todo = list(itertools.product(range(each), ("cold", "warm"), robots))
+        todo = list(itertools.product(("warm", "cold"), range(each), robots))
         for robot in robots:  # what the warm ones load
-            _driven_by_images(0, "warm", robot)
+            _driven_by_images("warm", 0, robot)
         results = pool.map(lambda job: _driven_by_images(*job), todo)
         with suppress(KeyboardInterrupt):  # what has come by then is told
             bar = tqdm(results, total=len(todo), mininterval=30)
-            for (_, kept, robot), (ended, wall_s, cpu_s) in zip(todo, bar, strict=True):
+            for (kept, _, robot), (ended, wall_s, cpu_s) in zip(todo, bar, strict=True):
                 loads.append(os.getloadavg()[0])
                 key = robot.folder.name, kept
                 rows.setdefault(key, []).append((wall_s, cpu_s))
@@ -430,7 +430,7 @@ def drive_strangers(each: int, jobs: int, processes: int) -> None:
 
 
 def _driven_by_images(
-    number: int, kept: str, robot: strangers.Stranger
+    kept: str, number: int, robot: strangers.Stranger
 ) -> tuple[str, float, float]:
     """How it ended, and how long it took."""
     begin_s = time.monotonic()
