@@ -24,12 +24,13 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from tqdm import tqdm
@@ -46,6 +47,8 @@ from tests.helpers.late import MAIN as MAIN_LATE  # noqa: E402
 MAIN = "import sys; from jaxnav.cli import main; sys.exit(main())"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ENDINGS = [*(number.name for number in SIGNALS), "time is over", "arrived"]
+Job = TypeVar("Job", bound=tuple[Any, ...])
+Result = TypeVar("Result")
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT)}
 
 
@@ -105,6 +108,19 @@ def _stalled_ms(path: Path, around_ns: int) -> int:
     return max((ms for ns, ms in rows if abs(ns - around_ns) < 1_000_000_000), default=0)
 
 
+def _in_turn(
+    pool: ThreadPoolExecutor, call: Callable[..., Result], todo: list[Job], loads: list[float]
+) -> Iterator[tuple[Job, Result]]:
+    """Each job with its result; what has not come by a Ctrl-C is left out. `loads`: is added to."""
+    results = pool.map(lambda job: call(*job), todo)
+    with suppress(KeyboardInterrupt):
+        bar = tqdm(results, total=len(todo), mininterval=30)
+        for job, result in zip(todo, bar, strict=True):
+            loads.append(os.getloadavg()[0])
+            yield job, result
+    pool.shutdown(cancel_futures=True)
+
+
 def _quantiles(values_ms: list[float]) -> str:
     median, late, most = np.quantile(values_ms, [0.5, 0.99, 1.0])
     return f"{median:.0f} | {late:.0f} | {most:.0f}"
@@ -120,15 +136,12 @@ def deaths(each: int, jobs: int, processes: int) -> None:
     with tempfile.TemporaryDirectory() as folder, load(processes), ThreadPoolExecutor(jobs) as pool:
         sleeper.start()
 
-        def one(number: int, how: str) -> tuple[str, float | None]:
-            return how, _death_ms(Path(folder) / f"{how}-{number}".replace(" ", "-"), how)
+        def one(number: int, how: str) -> float | None:
+            return _death_ms(Path(folder) / f"{how}-{number}".replace(" ", "-"), how)
 
         todo = [(number, how) for number in range(each) for how in ENDS]
-        loads = []
-        for how, ms in tqdm(
-            pool.map(lambda args: one(*args), todo), total=len(todo), mininterval=30
-        ):
-            loads.append(os.getloadavg()[0])
+        loads: list[float] = []
+        for (_, how), ms in _in_turn(pool, one, todo, loads):
             if ms is None:
                 never[how] += 1
             else:
@@ -141,7 +154,7 @@ def deaths(each: int, jobs: int, processes: int) -> None:
     print("|---|---|---|---|---|")
     for how, all_ms in took_ms.items():
         within = sum(ms <= 200 for ms in all_ms)
-        print(f"| {how} | {within} of {each} | {_quantiles(all_ms)} |")
+        print(f"| {how} | {within} of {len(all_ms) + never[how]} | {_quantiles(all_ms)} |")
     if never:
         print(f"never: {dict(never)}")
 
@@ -199,13 +212,11 @@ def signals(count: int, jobs: int, seed: int) -> None:
             for number in range(count)
             for kind in [rng.choice(list(lasts_s))]
         ]  # fmt: skip
-        results = []
-        pool = ThreadPoolExecutor(jobs)
-        with suppress(KeyboardInterrupt):  # what has come by then is told
-            for row in tqdm(pool.map(lambda args: _signalled(folder, *args), todo), total=count):
-                results.append(row)
-        pool.shutdown(cancel_futures=True)
-    print(f"drives last {lasts_s} s from exec; load {os.getloadavg()[0]:.1f}\n")
+        loads: list[float] = []
+        with ThreadPoolExecutor(jobs) as pool:
+            rows = _in_turn(pool, partial(_signalled, folder), todo, loads)
+            results = [row for _, row in rows]
+    print(f"drives last {lasts_s} s from exec; load {np.median(loads):.1f}\n")
     print(
         "| guard | phase | signals | ended at zero | exit code as documented | ms to zero, most |"
     )
@@ -268,28 +279,26 @@ def hangs(each: int, jobs: int, processes: int, whole: bool, ends: list[str]) ->
             which are soon up.
     """
     rows: dict[tuple[str, str], list[float]] = {}
-    missed, wrong, loads = 0, [], []
+    missed = 0
+    wrong: list[tuple[object, ...]] = []
+    loads: list[float] = []
     with tempfile.TemporaryDirectory() as made, load(processes), ThreadPoolExecutor(jobs) as pool:
         folder = Path(made)
-        run = partial(_hung_run, lasts_s=_drive_lasts_s(folder))
-        todo = [(how, end) for _ in range(each) for how in ("stopped", "held") for end in ends]
+        runs = set(ends if whole else ["arrived"])
+        lasts_s = _drive_lasts_s(folder) if runs & set(ends) else 0.0
+        todo = list(itertools.product(range(each), ("stopped", "held"), ends))
 
         def one(number: int, how: str, end: str) -> tuple[float, str] | None:
-            return (run if whole or end == "arrived" else _hung)(folder / str(number), how, end)
+            own = folder / f"{number} {how} {end}"
+            return _hung_run(own, how, end, lasts_s) if end in runs else _hung(own, how, end)
 
-        results = pool.map(lambda job: one(job[0], *job[1]), enumerate(todo))
-        with suppress(KeyboardInterrupt):  # what has come by then is told
-            for key, result in zip(
-                todo, tqdm(results, total=len(todo), mininterval=30), strict=True
-            ):
-                loads.append(os.getloadavg()[0])
-                if result is None:
-                    missed += 1  # it was over before it hung, or was rescued before its end
-                    continue
-                rows.setdefault(key, []).append(result[0])
-                if result[1]:
-                    wrong.append((*key, *result))
-        pool.shutdown(cancel_futures=True)
+        for (_, how, end), result in _in_turn(pool, one, todo, loads):
+            if result is None:
+                missed += 1  # it was over before it hung, or was rescued before its end
+                continue
+            rows.setdefault((how, end), []).append(result[0])
+            if result[1]:
+                wrong.append((how, end, *result))
     print(f"load {np.median(loads):.1f}; {missed} that hung too late or too early, left out\n")
     print("| the guard | and then | stood within 2 s, and said so | median ms | 99 % | most |")
     print("|---|---|---|---|---|---|")
@@ -399,23 +408,19 @@ def _hung_run(folder: Path, how: str, end: str, lasts_s: float) -> tuple[float, 
 def drive_strangers(each: int, jobs: int, processes: int) -> None:
     """A table: robots that are not the QCar, driven by rendered images, with and without what an
     earlier drive has compiled. Each must arrive, and nothing be compiled or loaded meanwhile."""
-    rows: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    wrong, loads = [], []
+    rows: dict[tuple[str, str], list[list[float]]] = {}
+    wrong: list[tuple[str, ...]] = []
+    loads: list[float] = []
     with tempfile.TemporaryDirectory() as made, load(processes), ThreadPoolExecutor(jobs) as pool:
         robots = [strangers.crawler(Path(made)), strangers.slider(Path(made))]
         todo = list(itertools.product(("warm", "cold"), range(each), robots))
         for robot in robots:  # what the warm ones load
             _driven_by_images("warm", 0, robot)
-        results = pool.map(lambda job: _driven_by_images(*job), todo)
-        with suppress(KeyboardInterrupt):  # what has come by then is told
-            bar = tqdm(results, total=len(todo), mininterval=30)
-            for (kept, _, robot), (ended, wall_s, cpu_s) in zip(todo, bar, strict=True):
-                loads.append(os.getloadavg()[0])
-                key = robot.folder.name, kept
-                rows.setdefault(key, []).append((wall_s, cpu_s))
-                if ended != "0 ended: arrived":
-                    wrong.append((*key, ended))
-        pool.shutdown(cancel_futures=True)
+        for (kept, _, robot), (ended, *took_s) in _in_turn(pool, _driven_by_images, todo, loads):
+            key = robot.folder.name, kept
+            rows.setdefault(key, []).append(took_s)
+            if ended != "0 ended: arrived":
+                wrong.append((*key, ended))
     print(f"load {np.median(loads):.1f}\n")
     print("| robot | compiled | arrived, nothing late | s, median | CPU s, median |")
     print("|---|---|---|---|---|")

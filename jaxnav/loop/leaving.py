@@ -12,19 +12,16 @@ class Corridor:
     """All that is within a distance of a drive's route."""
 
     def __init__(self, waypoints_m: Sequence[Sequence[float]] | np.ndarray, leave_m: float):
-        self._corners_m: list[list[float]] = np.asarray(waypoints_m, float).tolist()
-        self._leave_m, self._begins = leave_m, False
+        self._waypoints_m: list[list[float]] = np.asarray(waypoints_m, float).tolist()
+        self._leave_m = leave_m
+        self._legs_m: list[tuple[list[float], list[float]]] = []
 
     def is_left(self, place_m: Float[np.ndarray, " 2"]) -> bool:
         """Whether a place is outside; the first one asked about is where the route begins."""
-        place: list[float] = place_m.tolist()
-        if not self._begins:
-            self._corners_m.insert(0, place)
-            self._begins = True
-        legs_m = pairwise(
-            self._corners_m
-        )  # plain floats: of few legs NumPy takes ten times as long
-        return all(_off_m(place, *leg_m) > self._leave_m for leg_m in legs_m)
+        place: list[float] = place_m.tolist()  # of few legs NumPy takes ten times as long
+        if not self._legs_m:
+            self._legs_m = list(pairwise([place, *self._waypoints_m]))
+        return all(_off_m(place, *leg_m) > self._leave_m for leg_m in self._legs_m)
 
 
 def _off_m(place_m: Sequence[float], begin_m: Sequence[float], end_m: Sequence[float]) -> float:

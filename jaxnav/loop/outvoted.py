@@ -92,9 +92,6 @@ class Twins:
 
     Nothing in such a frame says which is right, or whether a camera is not where its file says. So
     the id is left out of all cameras. Where a sure estimate does, it judges (see `CameraVotes`).
-
-    Attributes:
-        last_ns: stamp of the last contradiction.
     """
 
     def __init__(self, navigator: Navigator):
@@ -108,7 +105,6 @@ class Twins:
         # When the first camera's look last contradicted the second's before it.
         self._after_ns = np.full((shape[0], *shape), _LONG_AGO_NS)
         self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
-        self.last_ns, self._lasting = _LONG_AGO_NS, False  # of all ids
 
     def warm_up(self) -> None:
         """Compile the program without changing anything."""
@@ -117,7 +113,12 @@ class Twins:
 
     def seen(self, now_ns: int) -> bool:
         """Whether there are such ids."""
-        return self._lasting or now_ns - self.last_ns < _TOGETHER_NS
+        return bool(self._votes.max() >= _LASTING or now_ns - self.last_ns < _TOGETHER_NS)
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last contradiction."""
+        return int(self._last_ns.max())
 
     def remove_twins(
         self, data: EventData, stamp_ns: int, way: Way, judged: bool = False
@@ -144,10 +145,6 @@ class Twins:
             self._seen_m = np.asarray(places_m, float)
             for marker in np.flatnonzero(shared).tolist():
                 self._compare(marker, np.flatnonzero(recent[:, marker]), stamp_ns, way, judged)
-            self.last_ns, self._lasting = (
-                int(self._last_ns.max()),
-                bool(self._votes.max() >= _LASTING),
-            )
         twins = (self._votes >= _LASTING) | (np.abs(stamp_ns - self._last_ns) < _TOGETHER_NS)
         return data.hiding(np.broadcast_to(twins, visible.shape)) if twins.any() else data
 
