@@ -1,8 +1,6 @@
 """Say when the vehicle has left its route: the way from where it began, past all waypoints."""
 
-import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -12,22 +10,17 @@ class Corridor:
     """All that is within a distance of a drive's route."""
 
     def __init__(self, waypoints_m: Sequence[Sequence[float]] | np.ndarray, leave_m: float):
-        self._waypoints_m: list[list[float]] = np.asarray(waypoints_m, float).tolist()
-        self._leave_m = leave_m
-        self._legs_m: list[tuple[list[float], list[float]]] = []
+        self._waypoints_m, self._leave_m = np.asarray(waypoints_m, float), leave_m
+        self._legs_m: tuple[np.ndarray, np.ndarray] | None = None  # begins, and ways to their ends
 
     def is_left(self, place_m: Float[np.ndarray, " 2"]) -> bool:
         """Whether a place is outside; the first one asked about is where the route begins."""
-        place: list[float] = place_m.tolist()  # of few legs NumPy takes ten times as long
-        if not self._legs_m:
-            self._legs_m = list(pairwise([place, *self._waypoints_m]))
-        return all(_off_m(place, *leg_m) > self._leave_m for leg_m in self._legs_m)
-
-
-def _off_m(place_m: Sequence[float], begin_m: Sequence[float], end_m: Sequence[float]) -> float:
-    """From a place to the nearest point of a leg."""
-    x_m, y_m = end_m[0] - begin_m[0], end_m[1] - begin_m[1]
-    to_x_m, to_y_m = place_m[0] - begin_m[0], place_m[1] - begin_m[1]
-    share = (to_x_m * x_m + to_y_m * y_m) / max(x_m * x_m + y_m * y_m, 1e-12)
-    share = min(max(share, 0.0), 1.0)
-    return math.hypot(to_x_m - share * x_m, to_y_m - share * y_m)
+        if self._legs_m is None:
+            corners_m = np.vstack([place_m, self._waypoints_m])
+            self._legs_m = corners_m[:-1], np.diff(corners_m, axis=0)
+        begins_m, ways_m = self._legs_m
+        to_m = place_m - begins_m
+        squared_m2 = np.maximum(np.sum(ways_m**2, axis=1), 1e-12)
+        share = np.clip(np.sum(to_m * ways_m, axis=1) / squared_m2, 0, 1)
+        off_m = to_m - share[:, None] * ways_m
+        return bool(np.min(np.sum(off_m**2, axis=1)) > self._leave_m**2)
