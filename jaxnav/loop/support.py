@@ -100,7 +100,9 @@ class Support:
             driven_mps, motion: that it tells; see `Chassis`.
             wanted_mps: None where somebody else commands them: they contradict nothing.
         """
-        self._ways.add_odometry(motion, pace_mps(driven_mps), heading_rad, gap_s)
+        pace = pace_mps(driven_mps)
+        self._ways.add_odometry(motion, pace, heading_rad, gap_s)
+        self.ranges.add_way(pace * gap_s)
         if wanted_mps is not None:
             parts = zip(self._propulsions, driven_mps, wanted_mps, strict=True)
             for propulsion, speed_mps, part_mps in parts:

@@ -16,6 +16,7 @@ measures, since a slow drag is hidden by wheel slip and a leap is not:
 Neither detects a copy carried slower than DRIFT_SHARE of the car's own speed or by less than the
 two margins, or one that was there from the beginning.
 
+    ranges.add_way(way_m)                                 # with every odometry
     ranges.add_place(lane, place_m, motion)               # with every frame that shows markers
     ranges.contradicted, ranges.lasting
 
@@ -55,8 +56,10 @@ _WHEELS = 0.05
 # different places in the image, as `_JITTER_M` where cameras are late while the vehicle speeds up.
 _LENS, _JITTER_M = 0.01, 0.01
 _STRIDE_M = 0.01  # between two looks that count: a standing vehicle tells nothing new
-_FORGETS_M = 0.5  # way on which the weight of a look falls to 1/e
-_LEAST_LOOKS, _IN_A_ROW = 5, 3
+# Way on which the weight of a look falls to 1/e: wheels seldom spin as far, so the way before and
+# after counts as well.
+_FORGETS_M = 2.0
+_LEAST_LOOKS, _IN_A_ROW = 4, 2
 _LEAP_SHARE = 0.1  # of the range, beyond the way: the vehicle or the marker was carried off
 # A lane whose ranges have agreed this well is as its files say: what differs later is slip.
 _TRUE = 0.15
@@ -192,7 +195,8 @@ class Ranges:
     """How the range of a marker changes by corners and by the odometer, in one drive.
 
     Over the last way, with weights that fade, ranges r by corners are fitted to those x that the
-    odometer alone gives: r = a + slope x. The slope is 1 where all files are true.
+    odometer alone gives: r = a + slope x. The slope is 1 where all files are true. Each camera and
+    marker, and each leap, has an a of its own.
 
     Attributes:
         contradicted: the slope is not, and never was with this camera and marker.
@@ -208,7 +212,10 @@ class Ranges:
     _range_m: float = 0.0
     _x_m: float = 0.0
     _since_m: float = 0.0  # way since the contradiction
-    _sums: list[float] = field(default_factory=lambda: [0.0] * 6)  # of 1, x, r, xx, xr, rr
+    _weight: float = 0.0  # of the looks with this a, and their means of x and r
+    _means_m: tuple[float, float] = (0.0, 0.0)
+    _free: float = 0.0  # weight of all looks but one for each a
+    _sums: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of xx, xr, rr about the means
     _odd: int = 0  # looks in a row that contradict
 
     @property
@@ -220,6 +227,10 @@ class Ranges:
     def agreed(self) -> bool:
         """Whether a camera and a marker have agreed with the way."""
         return bool(self._true)
+
+    def add_way(self, way_m: float) -> None:
+        """Take how far the vehicle has gone by odometry, whatever it sees."""
+        self._since_m += way_m
 
     def add_place(
         self,
@@ -242,31 +253,36 @@ class Ranges:
             nearer_m = self._range_m - math.hypot(x_m - motion[0], y_m - motion[1], z_m)
             leaps_m = abs(self._range_m - nearer_m - range_m)
         if lane != self._lane or motion is None or leaps_m > _LEAP_SHARE * range_m:
-            self._lane, self._x_m = lane, range_m
-            self._sums, self._odd = [0.0] * 6, 0
+            if lane != self._lane:
+                self._odd = 0
+                if self._lane in self._true:  # shows nothing of another one
+                    self._free, self._sums = 0.0, (0.0, 0.0, 0.0)
+            self._lane, self._x_m, self._weight = lane, range_m, 0.0
         elif way_m < _STRIDE_M:
             return False
         else:
             self._x_m -= nearer_m
-            self._since_m += way_m
         self._place_m, self._range_m = place_m, range_m
         self._look(range_m, math.exp(-way_m / _FORGETS_M))
         return True
 
     def _look(self, range_m: float, kept: float) -> None:
-        x_m, lane = self._x_m, self._lane
-        new = (1.0, x_m, range_m, x_m * x_m, x_m * range_m, range_m * range_m)
-        self._sums = [kept * old + one for old, one in zip(self._sums, new, strict=True)]
-        count, x, r, xx, xr, rr = self._sums
-        xx, xr, rr = xx - x * x / count, xr - x * r / count, rr - r * r / count
-        if count < _LEAST_LOOKS or xx <= 0 or lane is None:
+        x_m, lane, before = self._x_m, self._lane, kept * self._weight
+        x_mean_m, r_mean_m = self._means_m if before else (x_m, range_m)
+        dx, dr, self._weight = x_m - x_mean_m, range_m - r_mean_m, before + 1
+        self._means_m = x_mean_m + dx / self._weight, r_mean_m + dr / self._weight
+        share, new = before / self._weight, (dx * dx, dx * dr, dr * dr)
+        xx, xr, rr = (kept * old + share * one for old, one in zip(self._sums, new, strict=True))
+        self._sums, self._free = (xx, xr, rr), kept * self._free + bool(before)
+        free = self._free
+        if not before or free < _LEAST_LOOKS or xx <= 0 or lane is None:
             return
         self.slope = slope = xr / xx
-        noise = max(rr - slope * xr, 0.0) / (count - 2)
-        noise *= (1 + 4 / (count - 2)) ** 2  # three sigmas of Student's t: few looks tell it badly
+        noise = max(rr - slope * xr, 0.0) / (free - 1)
+        noise *= (1 + 4 / (free - 1)) ** 2  # three sigmas of Student's t: few looks tell it badly
         # An error that grows along the whole way, whose looks lie evenly on it.
         along = (_LENS * range_m) ** 2 + _JITTER_M**2
-        self.sigma = sigma = math.sqrt(noise / xx + along * count / (12 * xx) + _WHEELS**2)
+        self.sigma = sigma = math.sqrt(noise / xx + along * free / (12 * xx) + _WHEELS**2)
         off = abs(slope - 1)
         self._odd = self._odd + 1 if off > _SIGMAS * sigma else 0
         if off + sigma < _TRUE:

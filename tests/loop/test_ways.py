@@ -156,6 +156,7 @@ def looks(
         ahead_m, left_m = begin_m - (gone_m - speed * late_s), 0.3 * begin_m
         factor = toward * scale * (1 + noise * rng.standard_normal())
         place_m = (factor * ahead_m, factor * left_m, 0.2)
+        ranges.add_way(wheels / 60)
         if ranges.add_place(lane, place_m, (wheels * gone_m - told_m, 0.0, 0.0)):
             told_m = wheels * gone_m
         if ranges.contradicted and first is None:
@@ -193,9 +194,25 @@ def test_wheels_that_slip_later_leave_the_files_alone():
     ranges = Ranges()
     looks(ranges)
     assert looks(ranges, wheels=1.4, begin_m=1.5) is None
-    assert ranges.slope < 0.85
+    assert ranges.slope < 0.9
     # Another camera's file has not agreed with any way yet.
     assert looks(ranges, wheels=1.4, lane=(1, 0)) is not None
+
+
+def test_cameras_that_see_a_marker_in_turns_tell_it_together():
+    ranges = Ranges()
+    for camera in range(4):
+        named_m = looks(ranges, 1.5, way_m=0.2, begin_m=2.0, lane=(camera, 0))
+    assert named_m is not None
+    assert looks(Ranges(), 1.5, way_m=0.2, begin_m=2.0) is None
+
+
+def test_it_lasts_while_nothing_is_seen_as_well():
+    ranges = Ranges()
+    looks(ranges, scale=2.0, way_m=0.5)
+    assert not ranges.lasting
+    ranges.add_way(0.5)
+    assert ranges.lasting
 
 
 def test_it_is_forgotten_once_the_files_agree():
