@@ -80,6 +80,17 @@ def test_two_cameras_on_one_marker_merge_to_two():
         assert np.min(np.abs(kept - T).max(axis=(1, 2))) < 0.05
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_what_still_falls_towards_another_minimum_is_no_candidate(seed):
+    """Where it is after a number of steps is decided by rounding."""
+    rig, markers, obs = view(worlds.paper_markers(), worlds.OVERLAP_VIEW, 1.0, seed)
+    stopped, ended = (find(rig, markers, obs, max_steps=steps) for steps in (12, 60))
+    assert stopped.valid[0]
+    e1_px2 = np.asarray(stopped.e1_px2)[np.asarray(stopped.valid)]
+    at_end = np.asarray(ended.e1_px2)[np.asarray(ended.valid)]
+    np.testing.assert_allclose(e1_px2, at_end[: len(e1_px2)], rtol=0.02)
+
+
 def test_two_cameras_agree_on_two_distinct_poses():
     """Farther away, where the mirror pose is a minimum of the joint e1 as well."""
     pose = (1.2, -1.6, np.deg2rad(75.0))
