@@ -62,6 +62,9 @@ def are_mirrored(
 ) -> Bool[np.ndarray, " N"]:
     """Whether corners run as of a marker seen from behind, beyond their noise."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found elsewhere
+        turning = double_area_px2(corners_px) < 0
+        if not turning.any():
+            return turning
         falling, rising = (np.sum(line**2, axis=0) for line in _diagonals_px(corners_px))
         of_tl, of_tr, of_br, of_bl = np.moveaxis(sigma_px**2, -1, 0)
         variance = (of_tl + of_br) * rising + (of_tr + of_bl) * falling

@@ -100,11 +100,12 @@ class Twins:
         self._rig, self._size_m = rig, markers.size_m
         self._dtype = np.asarray(navigator.corner_sigma_px).dtype
         self._corners_px = np.zeros((*shape, 4, 2), self._dtype)
-        self._stamps_ns = np.full(shape, _LONG_AGO_NS)
+        # Of each marker, of each camera; lists, for single numbers are asked for.
+        self._stamps_ns = [[_LONG_AGO_NS] * shape[0] for _ in range(shape[1])]
         self._sigma_px, self._seen_m = np.ones(shape), np.zeros((*shape, 3))
         # When the first camera's look last contradicted the second's before it.
         self._after_ns = np.full((shape[0], *shape), _LONG_AGO_NS)
-        self._votes, self._last_ns = np.zeros(shape[1], int), np.full(shape[1], _LONG_AGO_NS)
+        self._votes, self._last_ns = [0] * shape[1], [_LONG_AGO_NS] * shape[1]
 
     def warm_up(self) -> None:
         """Compile the program without changing anything."""
@@ -113,12 +114,12 @@ class Twins:
 
     def seen(self, now_ns: int) -> bool:
         """Whether there are such ids."""
-        return bool(self._votes.max() >= _LASTING or now_ns - self.last_ns < _TOGETHER_NS)
+        return max(self._votes) >= _LASTING or now_ns - self.last_ns < _TOGETHER_NS
 
     @property
     def last_ns(self) -> int:
         """Stamp of the last contradiction."""
-        return int(self._last_ns.max())
+        return max(self._last_ns)
 
     def remove_twins(
         self, data: EventData, stamp_ns: int, way: Way, judged: bool = False
@@ -131,22 +132,30 @@ class Twins:
         """
         assert data.corners_px is not None
         assert data.visible is not None
-        visible = data.visible
+        visible, lanes = data.visible, np.argwhere(data.visible).tolist()
         if len(visible) < 2:
             return data
         assert data.sigma_px is not None
-        self._corners_px[visible] = data.corners_px[visible]
-        self._sigma_px[visible] = data.sigma_px[visible].max(axis=1)
-        self._stamps_ns[visible] = stamp_ns
-        recent = np.abs(stamp_ns - self._stamps_ns) < _TOGETHER_NS
-        shared = visible.any(axis=0) & (recent.sum(axis=0) > 1)
-        if shared.any() or visible.any(axis=1).sum() > 1:
+        for camera, marker in lanes:
+            self._corners_px[camera, marker] = data.corners_px[camera, marker]
+            self._sigma_px[camera, marker] = data.sigma_px[camera, marker].max()
+            self._stamps_ns[marker][camera] = stamp_ns
+        shared: dict[int, list[int]] = {}  # the cameras that have just seen a marker
+        for _, marker in lanes:
+            stamps_ns = enumerate(self._stamps_ns[marker])
+            recent = [camera for camera, ns in stamps_ns if abs(stamp_ns - ns) < _TOGETHER_NS]
+            if len(recent) > 1:
+                shared[marker] = recent
+        if shared or lanes[0][0] != lanes[-1][0]:
             places_m = sighted_places(self._rig, self._size_m, self._corners_px)
             self._seen_m = np.asarray(places_m, float)
-            for marker in np.flatnonzero(shared).tolist():
-                self._compare(marker, np.flatnonzero(recent[:, marker]), stamp_ns, way, judged)
-        twins = (self._votes >= _LASTING) | (np.abs(stamp_ns - self._last_ns) < _TOGETHER_NS)
-        return data.hiding(np.broadcast_to(twins, visible.shape)) if twins.any() else data
+        for marker, cameras in shared.items():
+            self._compare(marker, cameras, stamp_ns, way, judged)
+        twins = [
+            votes >= _LASTING or abs(stamp_ns - last_ns) < _TOGETHER_NS
+            for votes, last_ns in zip(self._votes, self._last_ns, strict=True)
+        ]
+        return data.hiding(np.broadcast_to(twins, visible.shape)) if any(twins) else data
 
     def place_m(self, camera: int, marker: int) -> list[float]:
         """Where a sighting has its marker; known while several cameras are in view."""
@@ -154,25 +163,25 @@ class Twins:
         return place_m
 
     def _compare(
-        self, marker: int, cameras: np.ndarray, stamp_ns: int, way: Way, judged: bool
+        self, marker: int, cameras: list[int], stamp_ns: int, way: Way, judged: bool
     ) -> None:
-        now = way.at(stamp_ns)
+        now, stamps_ns = way.at(stamp_ns), self._stamps_ns[marker]
         # A range is as noisy as the longest side in the image.
         corners_px = self._corners_px[:, marker]
         sides_px = np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=1), axis=2).max(axis=1)
         noise = self._sigma_px[:, marker] / np.maximum(sides_px, 1.0)
         places_m: list[tuple[int, np.ndarray]] = []
-        for camera in cameras.tolist():
-            then_ns, at_m = int(self._stamps_ns[camera, marker]), self._seen_m[camera, marker]
-            if then_ns != stamp_ns:
-                then = way.at(then_ns)
+        for camera in cameras:
+            at_m = self._seen_m[camera, marker]
+            if stamps_ns[camera] != stamp_ns:
+                then = way.at(stamps_ns[camera])
                 if now is None or then is None:
                     continue
                 ahead_m, left_m, _ = between(between(then, now), (at_m[0], at_m[1], 0.0))
                 at_m = np.array([ahead_m, left_m, at_m[2]])
             places_m.append((camera, at_m))
         for (one, one_m), (other, other_m) in combinations(places_m, 2):
-            if stamp_ns not in self._stamps_ns[[one, other], marker]:
+            if stamp_ns not in (stamps_ns[one], stamps_ns[other]):
                 continue
             farther_m = max(np.linalg.norm(one_m), np.linalg.norm(other_m))
             share = _APART_SHARE + _SIGMAS * float(np.linalg.norm(noise[[one, other]]))
@@ -186,8 +195,9 @@ class Twins:
         """Whether two looks that contradict each other are of one time, or follow others of these
         cameras that did in the other order: a vehicle that was carried off makes one contradiction.
         """
-        if self._stamps_ns[one, marker] == self._stamps_ns[other, marker]:
+        of_one_ns, of_other_ns = self._stamps_ns[marker][one], self._stamps_ns[marker][other]
+        if of_one_ns == of_other_ns:
             return True
-        newer, older = (one, other) if self._stamps_ns[one, marker] == stamp_ns else (other, one)
+        newer, older = (one, other) if of_one_ns == stamp_ns else (other, one)
         self._after_ns[newer, older, marker] = stamp_ns
         return bool(stamp_ns - self._after_ns[older, newer, marker] < _TOGETHER_NS)

@@ -419,19 +419,19 @@ class Pilot:
 
     def _add_place(self, data: EventData, stamp_ns: int, candidates: Candidates) -> None:
         """Watch how the range of a marker in view changes; see `Ranges`."""
-        visible, valid = data.visible, np.asarray(candidates.valid)
-        assert visible is not None
+        assert data.visible is not None
+        valid = np.asarray(candidates.valid)
+        best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
         then_ns, way = self._look_ns, self._standstill.way
-        if not valid.any() or stamp_ns <= then_ns:
+        if not valid[best] or stamp_ns <= then_ns:
             return
-        if not visible[self._lane]:
-            camera, marker = np.argwhere(visible)[0].tolist()
-            self._lane = camera, marker
-        if visible.any(axis=1).sum() > 1:
+        lanes = [(camera, marker) for camera, marker in np.argwhere(data.visible).tolist()]
+        if self._lane not in lanes:
+            self._lane = lanes[0]
+        if lanes[0][0] != lanes[-1][0]:
             # Of several cameras the pose is theirs together: their places tell its range.
             place_m = self._twins.place_m(*self._lane)
         else:
-            best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
             T_vehicle_world = np.asarray(candidates.T_vehicle_world.wxyz_xyz)[best].tolist()
             turned = rotated(T_vehicle_world[:4], self._centres_m[self._lane[1]])
             place_m = [a + b for a, b in zip(turned, T_vehicle_world[4:], strict=True)]
