@@ -120,8 +120,10 @@ def find_candidates(
     # Corners far outside of any image can overflow; such a lane is no candidate.
     finite = jnp.isfinite(e1_px2) & jnp.isfinite(refined.cost)
     valid = owner_visible & finite
-    # What still falls after the last step is on its way from one minimum to another.
-    valid &= refined.converged | ~jnp.any(valid & refined.converged)
+    # Of several sightings, what still falls after the last step is on its way from the minimum of
+    # one to that of all. Of one it is near its own: two that are about to become one are flat.
+    alone = jnp.sum(seen.visible) < 2
+    valid &= refined.converged | alone | ~jnp.any(valid & refined.converged)
     e1_px2 = jnp.where(finite, e1_px2, 0)
     refined = eqx.tree_at(lambda r: r.cost, refined, jnp.where(finite, refined.cost, 0))
     order = in_order(-jnp.where(valid, e1_px2, jnp.inf), count)
