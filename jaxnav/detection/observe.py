@@ -62,13 +62,13 @@ def are_mirrored(
 ) -> Bool[np.ndarray, " N"]:
     """Whether corners run as of a marker seen from behind, beyond their noise."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is found elsewhere
-        turning = double_area_px2(corners_px) < 0
-        if not turning.any():
-            return turning
+        area_px2 = double_area_px2(corners_px)
+        if not (area_px2 < 0).any():
+            return np.zeros(len(area_px2), bool)
         falling, rising = (np.sum(line**2, axis=0) for line in _diagonals_px(corners_px))
         of_tl, of_tr, of_br, of_bl = np.moveaxis(sigma_px**2, -1, 0)
         variance = (of_tl + of_br) * rising + (of_tr + of_bl) * falling
-        return double_area_px2(corners_px) < -_MIRRORED_SIGMAS * np.sqrt(variance)
+        return area_px2 < -_MIRRORED_SIGMAS * np.sqrt(variance)
 
 
 def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes:

@@ -132,10 +132,11 @@ class Twins:
         """
         assert data.corners_px is not None
         assert data.visible is not None
-        visible, lanes = data.visible, np.argwhere(data.visible).tolist()
+        visible = data.visible
         if len(visible) < 2:
             return data
         assert data.sigma_px is not None
+        lanes = np.argwhere(visible).tolist()
         for camera, marker in lanes:
             self._corners_px[camera, marker] = data.corners_px[camera, marker]
             self._sigma_px[camera, marker] = data.sigma_px[camera, marker].max()

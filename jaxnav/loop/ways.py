@@ -53,8 +53,8 @@ _SIGMAS = 3.0
 # slip of 5 % that forgets itself on 0.2 m, over half a metre (`SENSORS_AS_TOLD`, `slip_sigma`).
 _WHEELS = 0.053
 # The noise counts this many times: of many looks in a row one is further off than three sigmas.
-# Fitted with what is beside it to 180 sound drives with wheels that are 10 % off, spin for 1 s of
-# each 3, or do both: two of 75 that did both were blamed (`bench_lies.py --clean`).
+# Fitted with what is beside it to 261 sound drives with wheels that are 10 % off, spin for 1 s of
+# each 3, do both or neither: two of 105 that did both were blamed (`bench_lies.py --clean`).
 _MANY_LOOKS = 1.25
 # A range may be off by this share of it at one place, and not at the next: what lenses leave at
 # different places in the image, as `_JITTER_M` where cameras are late while the vehicle speeds up.
