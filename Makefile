@@ -3,6 +3,7 @@
 
 PYTHON ?= python3
 WORKERS ?= 2
+MARKS ?= not long
 MINUTES ?= 60
 SEED ?= $(shell date +%s)
 VENV := .venv
@@ -18,7 +19,7 @@ ROS_SOURCES := $(shell find ros/environment ros/jaxnav_msgs -type f)
 help:
 	@echo "make demo       the main job: two simulated drives, their report in demo/"
 	@echo "make test       lint, types, tests, but for those that take longest"
-	@echo "make test-all   with those"
+	@echo "make test-all   with those, notebooks and ROS"
 	@echo "make test-fast  the core and most commands, some minutes: tests/fast.txt"
 	@echo "make lint       ruff and mypy alone"
 	@echo "make format     let ruff rewrite what it can"
@@ -34,10 +35,10 @@ demo: $(VENV)/.installed
 	@echo "for all other commands: . $(VENV)/bin/activate, or $(VENV)/bin/jaxnav --help"
 
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "not long"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "$(MARKS)"
 
-test-all: lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+test-all:
+	$(MAKE) --no-print-directory test test-ros MARKS=
 
 test-fast: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile @tests/fast.txt
@@ -68,7 +69,7 @@ ros: $(ROS)/.installed
 # Where there are no wheels, nothing is tested and nothing has failed.
 test-ros:
 	@if [ -e $(ROS)/.created ] || lacking=$$($(PYTHON) ros/environment/build.py --wheels 2>&1); then \
-	  $(MAKE) --no-print-directory $(ROS)/.installed && $(ROS)/bin/python -m pytest tests/real_ros; \
+	  $(MAKE) --no-print-directory $(ROS)/.installed && $(ROS)/bin/python -m pytest -m "$(MARKS)" tests/real_ros; \
 	else echo "tests/real_ros are left out: $$lacking"; fi
 
 clean:

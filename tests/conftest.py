@@ -90,7 +90,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--update-refs", action="store_true", help=told)
 
 
+# Before `-m` leaves out what is long.
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.suffix == ".ipynb":
+            item.add_marker(pytest.mark.long)
     items.sort(key=lambda item: item.path.stem not in LONG)
 
 

@@ -377,6 +377,7 @@ def test_derivatives_of_a_step():
     check_derivatives(outcome, *arguments, parameters_of(nav), step=1e-6, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.long
 @in_float32
 def test_a_rollout_of_20_steps_has_a_finite_gradient(precision):
     """With respect to the filter's noise and the gains, through frames without a marker."""

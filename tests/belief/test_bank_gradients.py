@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxnav.models.geometry import T_world_vehicle_from_planar
 from jaxnav.navigator import Navigator
@@ -88,6 +89,7 @@ def three_ways(obs):
     return jax.lax.map(one, obs)
 
 
+@pytest.mark.long
 def test_derivatives_are_differences_wherever_these_agree():
     """Where a merge, a forgotten hypothesis or another heaviest one falls between, they do not.
 

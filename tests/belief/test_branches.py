@@ -224,6 +224,7 @@ def through_the_frontal_view(selector: MultiHypothesis):
     return tuple(np.stack(leaves) for leaves in zip(*drives, strict=True))
 
 
+@pytest.mark.long
 def test_a_bank_that_took_the_wrong_pose_at_the_frontal_view_finds_back():
     """Three metres off, the marker 18 px wide: further on the image contradicts what it follows."""
 

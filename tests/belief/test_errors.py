@@ -147,7 +147,7 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
-@pytest.mark.parametrize("body", ["car", "free"])
+@pytest.mark.parametrize("body", ["car", pytest.param("free", marks=pytest.mark.long)])
 def test_a_start_far_from_its_guess_keeps_a_covariance(navigator, body):
     """Hypotheses of the fan turn by degrees onto the corners, and 3 m away a degree is 5 cm: the
     turns of the cameras go with the corrected pose, not with the guess."""

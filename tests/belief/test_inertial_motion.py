@@ -312,6 +312,7 @@ def test_rest_weighs_the_hypotheses_by_how_well_they_rest():
     np.testing.assert_allclose(after.log_weight, bank.log_weight)
 
 
+@pytest.mark.long
 @in_float32
 def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
     """Of a prediction by its readings, the priors, and the state."""

@@ -201,6 +201,7 @@ def test_a_walk_goes_on_by_the_imu_where_no_marker_is_in_view(walk, tmp_path):
     assert without[-1] > 5 * with_imu[-1]
 
 
+@pytest.mark.long
 def test_replay_takes_a_topic_map_with_an_imu_for_a_rig_s(walk, tmp_path, capsys):
     path = bag_of(walk).write(tmp_path)
     topic_map(tmp_path, TOPICS)

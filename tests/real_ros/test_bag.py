@@ -43,7 +43,7 @@ def bag_of_a_drive(kind: str) -> Bag:
     return bag
 
 
-@pytest.mark.parametrize("kind", ["db3", "mcap"])
+@pytest.mark.parametrize("kind", [pytest.param("db3", marks=pytest.mark.long), "mcap"])
 def test_a_bag_gives_the_states_of_a_replay(tmp_path, kind):
     path = bag_of_a_drive(kind).write(tmp_path)
     file = write_file(tmp_path)

@@ -4,6 +4,7 @@ import time
 
 import jaxlie
 import numpy as np
+import pytest
 
 from jaxnav.datasets.recordings import read_recording
 from jaxnav.detection.types import Detections
@@ -18,6 +19,7 @@ SIGMA_PX = 0.5
 IDS = 1, 7
 
 
+@pytest.mark.long
 def test_frames_played_in_real_time_give_the_poses_of_a_replay(tmp_path, data_dir):
     folder = data_dir / "tagslam/test_7"
     markers = two_of(read_recording(folder).markers)

@@ -245,6 +245,7 @@ def check_saved(listener: Listener, folder: Path) -> None:
     assert wrong.message == f"save: there is no folder {folder}/none"
 
 
+@pytest.mark.long
 def test_it_drives_by_the_time_of_a_simulation_and_by_lenses_that_topics_tell(tmp_path, listener):
     rig = (calib_dir() / "qcar/rig.yaml").read_text()
     (tmp_path / "rig.yaml").write_text(rig.replace("[319.0, 319.0]", "[250.0, 250.0]"))

@@ -254,6 +254,7 @@ def test_a_pose_is_carried_back_along_its_arcs():
     np.testing.assert_allclose(wrapped(poses[:, 2] - begins[:, 2]), 0, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loss", [0, 1, 2], ids=["likelihood", "score", "error"])
 def test_gradients_are_central_differences(loss):
     """Every entry of x by itself, in a drive that loses sight of its marker."""
@@ -369,6 +370,7 @@ def standing(drive: FrameSequences, pose, visible=True) -> FrameSequences:
     )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["padded", "frontal", "oblique", "nothing seen", "no time"])
 def test_gradients_are_finite(kind):
     """In float32; a frontal view has no mirror image, and the long ones use all their frames."""

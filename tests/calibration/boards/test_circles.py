@@ -73,6 +73,7 @@ def test_centres_are_found_through_a_lens(kind: str, pose: int) -> None:
     assert np.sqrt(np.mean(off_px(board, light.corners_px, POSES[pose]) ** 2)) < 0.015
 
 
+@pytest.mark.long
 def test_discs_calibrate_a_lens(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for number in range(14):

@@ -83,6 +83,7 @@ def test_rendered_images_become_a_rig_with_its_sigmas(shots, tmp_path, capsys) -
     assert "next: take more views" in out
 
 
+@pytest.mark.long
 def test_rendered_images_of_another_wide_lens_tell_it(tmp_path):
     """In the file that `load_rig` and the other commands take."""
     lens, bent = "omni", [0.9, -0.05, 0.01, 1e-3, -5e-4]

@@ -88,6 +88,7 @@ def test_no_marker_in_view_is_a_result(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["markers"] == []
 
 
+@pytest.mark.long
 def test_a_blurred_photograph_is_restored_to_be_read(rendered, tmp_path, capsys):
     path, T_camera_marker = rendered
     blurred = cv2.blur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (9, 1))
@@ -103,6 +104,7 @@ def test_a_blurred_photograph_is_restored_to_be_read(rendered, tmp_path, capsys)
     np.testing.assert_allclose(position_m, truth_m, atol=0.02)
 
 
+@pytest.mark.long
 def test_every_tag_that_either_detector_finds_is_found_once(data_dir, tmp_path, capsys):
     photo = data_dir / "apriltag_photos" / "34085369442_304b6bafd9_c.jpg"
     (tmp_path / "camera.yaml").write_text(

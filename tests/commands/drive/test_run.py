@@ -177,7 +177,10 @@ def assert_arrived(ended: Ended) -> None:
     assert ended.told[-1].throttle == 0
 
 
-@pytest.mark.parametrize(("family", "marker_id"), [("tag36h11", 5), ("4x4_50", 17)])
+@pytest.mark.parametrize(
+    ("family", "marker_id"),
+    [("tag36h11", 5), pytest.param("4x4_50", 17, marks=pytest.mark.long)],
+)
 def test_images_of_any_map_end_no_drive(workplace, tmp_path, family, marker_id):
     """Programs that are made or loaded in a watched thread would."""
     markers = (ROOT / "calib/qcar/markers.yaml").read_text()

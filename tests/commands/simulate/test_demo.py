@@ -84,6 +84,7 @@ def test_both_methods_drive_from_images_and_one_listens(tmp_path, capsys, monkey
     assert rates.endswith("docs/guide/demo.md")
 
 
+@pytest.mark.long
 def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
     (tmp_path / "markers.yaml").write_text(
         "markers: [{id: 7, family: 4x4_50, size_m: 0.25, corners_world_m: "

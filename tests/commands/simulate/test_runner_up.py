@@ -4,6 +4,7 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jaxlie import SE3, SO3
 
 from jaxnav.belief.selectors import make_selector
@@ -72,6 +73,7 @@ def opencv_s_poses(rig: CameraRig, markers: MarkerMap, corners_px: np.ndarray) -
     ]
 
 
+@pytest.mark.long
 def test_the_pose_taken_is_the_first_of_solve_pnp_generic():
     """Of 60 frames with noise it is another one only where both fit about alike."""
     rig, markers = load_rig(QCAR / "rig.yaml"), load_markers(QCAR / "markers.yaml")

@@ -131,6 +131,7 @@ def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path, stranger):
     assert json.loads(file.read_text())["drives"] == 3
 
 
+@pytest.mark.long
 def test_parameters_drive_and_are_what_a_result_belongs_to(tmp_path, capsys, monkeypatch):
     file, params = tmp_path / "s.json", tmp_path / "params.yaml"
     gains = ("controller.proportional_per_m", "controller.integral_per_ms")
@@ -195,6 +196,7 @@ def test_every_scenario_can_be_named(capsys):
     assert "--laps" in help_text
 
 
+@pytest.mark.long
 def test_laps_are_driven_and_their_later_errors_shown(tmp_path, capsys):
     file = tmp_path / "s.json"
     arguments = ["--seeds", "2", "--selector", "oracle", "--json", str(file), "--headless"]

@@ -82,6 +82,7 @@ def test_a_base_has_gains_and_noise_of_its_own():
         assert {"motion.acceleration_density", "motion.odometry_sigma"} < learned
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stranger", ["crawler"], indirect=True)
 def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch, stranger):
     """A better loss on what was held out; the same command has nothing left to do, another one is

@@ -158,6 +158,7 @@ def test_too_short_a_recording_says_what_is_needed(test_7):
         sequences_of_recording(short, False, (0, 0.5))
 
 
+@pytest.mark.long
 def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
     recorded = sequences_of_recording(test_7, True, (0, 1), length=12, shortest=6)
     rows = np.linspace(0, len(recorded) - 1, 20).astype(int)
