@@ -1,7 +1,7 @@
 """How far a vehicle goes on a lie of its motion or its files; how often a sound one is blamed.
 
     python benchmarks/bench_lies.py [--base ackermann|differential|omni] [--imu NAME] [--seeds N]
-    python benchmarks/bench_lies.py --clean N [--base ...]
+    python benchmarks/bench_lies.py --clean N [--first-seed 1000] [--base ...]
 
 Lockstep drives of the fault matrix' rows of lies, N seeds each, as a table; or N sound drives, each
 with a start, a route, wheels and corners of its own, in which no fault of these may be told.
@@ -64,6 +64,7 @@ def main() -> None:
     parser.add_argument("--imu", choices=IMUS, default="none")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--clean", type=int, default=0)
+    parser.add_argument("--first-seed", type=int, default=0)
     args = parser.parse_args()
     configure(float64=False, threads=1)
     qcar = calib_dir() / "qcar"
@@ -75,7 +76,8 @@ def main() -> None:
     )
     if args.clean:
         told: Counter[str] = Counter()
-        for seed in tqdm(range(args.clean), mininterval=10):
+        seeds = range(args.first_seed, args.first_seed + args.clean)
+        for seed in tqdm(seeds, mininterval=10):
             tunnel = inject.between(4.0, 7.0, TUNNEL) if seed % 2 else lambda given: [given]
             row = FaultRow("sound", lambda tunnel=tunnel: tunnel, begins_s=0.0, drive_s=12.0)
             result = run_trial(row, sound(trial, seed))
@@ -87,7 +89,7 @@ def main() -> None:
     print(HEADER)
     for row in matrix():
         if row.suits(trial) and row.faults & LIES:
-            for seed in range(args.seeds):
+            for seed in range(args.first_seed, args.first_seed + args.seeds):
                 print(line(run_trial(row, dataclasses.replace(trial, seed=seed))), flush=True)
 
 
