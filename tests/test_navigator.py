@@ -445,6 +445,7 @@ def spanning(bank):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("start", ["empty", "one that spans both poses"])
 def test_step_by_regime_is_step(start):
     """A start with the whole bank, a few hypotheses, one; one sighting, two and none."""

@@ -563,6 +563,7 @@ def parked(sigma_px: float) -> Seen:
     return run(nav, sensed(poses, 0.0, sigma_px=sigma_px))
 
 
+@pytest.mark.long
 def test_a_parked_car_far_away_does_not_know_at_first_and_says_so():
     """One look does not tell the poses apart. Many, of independent noise, may in the end."""
     seen = parked(1.0)

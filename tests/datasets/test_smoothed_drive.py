@@ -79,6 +79,7 @@ def test_it_is_known_as_well_as_it_says(tracks):
     assert np.all(np.abs(turn) < 3 * smoothed.sigma_rad)
 
 
+@pytest.mark.long
 def test_a_recorded_drive_is_smoothed_from_the_command_line(tmp_path, capsys):
     """Also where somebody carries the car off: two tracks, and none between them."""
     arguments = ["replay", FOLDER / "kidnapped.mcap", "--smooth", "--out", tmp_path, "--headless"]
