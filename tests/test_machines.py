@@ -5,10 +5,12 @@
 
 import jax
 import numpy as np
+import pytest
 
 from benchmarks import bench_machines as machines
 
 
+@pytest.mark.long
 def test_a_step_a_start_a_merge_and_two_cameras_are_decided_alike(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
     monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
