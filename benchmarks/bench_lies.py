@@ -74,9 +74,9 @@ def main() -> None:
         equipped(load_vehicle(qcar / "vehicle.yaml"), args.base, args.imu),
         program=lambda navigator: compile_or_load(advance_packed, navigator, step_folder()),
     )
+    seeds = range(args.first_seed, args.first_seed + (args.clean or args.seeds))
     if args.clean:
         told: Counter[str] = Counter()
-        seeds = range(args.first_seed, args.first_seed + args.clean)
         for seed in tqdm(seeds, mininterval=10):
             tunnel = inject.between(4.0, 7.0, TUNNEL) if seed % 2 else lambda given: [given]
             row = FaultRow("sound", lambda tunnel=tunnel: tunnel, begins_s=0.0, drive_s=12.0)
@@ -89,7 +89,7 @@ def main() -> None:
     print(HEADER)
     for row in matrix():
         if row.suits(trial) and row.faults & LIES:
-            for seed in range(args.first_seed, args.first_seed + args.seeds):
+            for seed in seeds:
                 print(line(run_trial(row, dataclasses.replace(trial, seed=seed))), flush=True)
 
 
