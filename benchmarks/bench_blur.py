@@ -24,10 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import jaxnav
 from benchmarks.bench_detection import DATA, apriltag, opencv, row
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection import Acquirer, make_detector, marker_cells
 from jaxnav.detection.track import Target, Track, track
 from jaxnav.files.images import read_image
-from jaxnav.models.camera import Camera
 from tests.helpers import marker_images
 from tests.helpers.marker_images import Scene, rotation
 from tests.helpers.other_pictures import other_pictures

@@ -15,15 +15,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from jaxnav.calibration.boards import detection as board_detection
-from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.boards.saddles import fit_saddles
-from jaxnav.calibration.boards.sheets import sheet_of
-from jaxnav.configuration import configure
+from jaxnav.calibrate.board import detection as board_detection
+from jaxnav.calibrate.board.board import Board
+from jaxnav.calibrate.board.saddles import fit_saddles
+from jaxnav.calibrate.board.sheets import sheet_of
 from jaxnav.detection.families import dictionary
 from jaxnav.files import calib_dir, load_rig
-from jaxnav.simulation.boards import BoardRenderer, facing_pose
-from jaxnav.simulation.sensor import Sensor
+from jaxnav.files.configuration import configure
+from jaxnav.sim.boards import BoardRenderer, facing_pose
+from jaxnav.sim.sensor import Sensor
 
 TABLE = Path(__file__).with_name("README-boards.md")
 VIEWS = 20

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxnav.configuration import FLAGS
+from jaxnav.files.configuration import FLAGS
 
 MARKERS, OPENCV_LANES, ROUNDS = 4096, 100, 9
 EMITTERS, YNNPACK = (f"--{flag}={value}" for flag, value in FLAGS.items())

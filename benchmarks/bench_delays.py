@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.drive.camera_delays import CameraDelays
+from jaxnav.drive.history import EventData
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.loop.camera_delays import CameraDelays
-from jaxnav.loop.history import EventData
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.simulation.corners import see
-from jaxnav.testing.faults import WAYPOINTS_M
+from jaxnav.sim.corners import see
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
 
 STEP_S, FRAME_S, READING_S = 0.005, 1 / 30, 0.02
 START_SPREAD = np.array([0.1, 0.1, math.radians(10.0)])

@@ -11,9 +11,9 @@ import jaxnav
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.demo_drives import OPENCV, START_SPREAD, Method, make_methods
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
-from jaxnav.models.geometry import wrap_angle_np
-from jaxnav.pose.observation import Observation
-from jaxnav.simulation.scores import WRONG_DEG
+from jaxnav.core.models.geometry import wrap_angle_np
+from jaxnav.core.pose.observation import Observation
+from jaxnav.sim.scores import WRONG_DEG
 
 DISTANCES_M = (2.0, 2.5, 3.0, 3.5)  # from the marker
 ASIDE_DEG = (-30, -20, -10, 0, 10, 20, 30, 40)  # of its normal, positive where the waypoints are

@@ -17,10 +17,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.detection.families import dictionary
 from jaxnav.files.images import read_image
-from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import Scene, random_scene, rotation
 
 FAMILY = "tag36h11"

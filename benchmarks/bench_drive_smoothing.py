@@ -7,18 +7,18 @@ the filter knew at every event, and what is known of it at the end (`jaxnav repl
 import argparse
 from pathlib import Path
 
-from jaxnav.configuration import configure
+from jaxnav.files.configuration import configure
 
 configure(float64=True)  # before the first array
 
 import numpy as np  # noqa: E402
 
-from jaxnav.datasets.smoothed_drive import DriveTrack, distances, smooth_drive  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.recording.drive_events import DriveEvents  # noqa: E402
-from jaxnav.recording.drive_setup import DriveSetup  # noqa: E402
-from jaxnav.testing.faults import WAYPOINTS_M  # noqa: E402
-from jaxnav.testing.lockstep import BEGIN_NS, drive  # noqa: E402
+from jaxnav.recordings.drive_events import DriveEvents  # noqa: E402
+from jaxnav.recordings.drive_setup import DriveSetup  # noqa: E402
+from jaxnav.recordings.other.smoothed_drive import DriveTrack, distances, smooth_drive  # noqa: E402
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M  # noqa: E402
+from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, drive  # noqa: E402
 from jaxnav.vehicles.world import SimWorld  # noqa: E402
 
 START = (2.0, -1.0, 2.2)

@@ -16,23 +16,23 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.evaluation import judge_branch
-from jaxnav.belief.free_body import FreeBody
-from jaxnav.belief.inertial_motion import InertialMotion
-from jaxnav.belief.kalman import nis
-from jaxnav.configuration import configure
-from jaxnav.models.geometry import (
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.evaluation import judge_branch
+from jaxnav.core.filter.free_body import FreeBody
+from jaxnav.core.filter.inertial_motion import InertialMotion
+from jaxnav.core.filter.kalman import nis
+from jaxnav.core.models.geometry import (
     inverse_cayley,
     rotation_error_rad,
     rotation_from_matrix,
     safe_norm,
 )
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.preintegration import CONSUMER, TACTICAL, ImuNoise
-from jaxnav.navigator import Navigator
-from jaxnav.simulation.hand_held import HandHeld, imu_samples, observe
-from jaxnav.simulation.single_frames import pinhole_rig
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.preintegration import CONSUMER, TACTICAL, ImuNoise
+from jaxnav.core.navigator import Navigator
+from jaxnav.files.configuration import configure
+from jaxnav.sim.hand_held import HandHeld, imu_samples, observe
+from jaxnav.sim.single_frames import pinhole_rig
 
 CENTER_M = (0.0, 0.0, 1.0)
 RATE_HZ, END_S, SETTLED_S = 15, 8.0, 1.0

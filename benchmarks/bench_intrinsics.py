@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from jaxnav.calibration.lenses import bundle as lens_bundle
-from jaxnav.calibration.lenses.bundle import NO_CUT
-from jaxnav.calibration.lenses.fit import LensFit, fit_lens
-from jaxnav.calibration.lenses.simulated_views import grid_points_m, seen_from, simulated_views
-from jaxnav.calibration.lenses.start import board_poses, opencv_calibration
-from jaxnav.calibration.lenses.views import BoardViews
-from jaxnav.configuration import configure
-from jaxnav.models.camera import Camera
+from jaxnav.calibrate.lens import bundle as lens_bundle
+from jaxnav.calibrate.lens.bundle import NO_CUT
+from jaxnav.calibrate.lens.fit import LensFit, fit_lens
+from jaxnav.calibrate.lens.simulated_views import grid_points_m, seen_from, simulated_views
+from jaxnav.calibrate.lens.start import board_poses, opencv_calibration
+from jaxnav.calibrate.lens.views import BoardViews
+from jaxnav.core.models.camera import Camera
+from jaxnav.files.configuration import configure
 
 TRIALS, ROUNDS, VIEWS, SIGMA_PX = 100, 15, 40, 0.1
 IMAGE_SIZE_PX = (820, 410)

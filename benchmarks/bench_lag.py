@@ -9,21 +9,21 @@ import time
 
 import numpy as np
 
-from jaxnav.configuration import configure
+from jaxnav.files.configuration import configure
 
 configure(float64=False, threads=1)  # before the first array, as the commands do
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
-from jaxnav.belief.constant_velocity import ConstantVelocity  # noqa: E402
+from jaxnav.core.filter.constant_velocity import ConstantVelocity  # noqa: E402
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar  # noqa: E402
+from jaxnav.core.models.markers import MarkerMap  # noqa: E402
+from jaxnav.core.models.rig import CameraRig  # noqa: E402
+from jaxnav.core.navigator import Navigator, State  # noqa: E402
+from jaxnav.core.pose.observation import Observation  # noqa: E402
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.models.geometry import T_world_vehicle_from_planar  # noqa: E402
-from jaxnav.models.markers import MarkerMap  # noqa: E402
-from jaxnav.models.rig import CameraRig  # noqa: E402
-from jaxnav.navigator import Navigator, State  # noqa: E402
-from jaxnav.pose.observation import Observation  # noqa: E402
-from jaxnav.simulation.corners import see  # noqa: E402
+from jaxnav.sim.corners import see  # noqa: E402
 
 PERIOD_S, LAG_S, SIGMA_PX = 1 / 30, 2.0, 0.3
 FILLS, TIMED, ROUNDS = 100, 50, 20  # steps that fill the window, steps of a round, rounds

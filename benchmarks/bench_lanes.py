@@ -18,8 +18,8 @@ import pytest
 from jax import lax
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from jaxnav.lanes.over_lanes import compiler_options, over_lanes
-from jaxnav.lanes.rules import RULES
+from jaxnav.core.lanes.over_lanes import compiler_options, over_lanes
+from jaxnav.core.lanes.rules import RULES
 
 LANES, ROUNDS = 4096, 40
 # Of a lane's matrix (6, 6) and one index, 0 to 5.

@@ -15,7 +15,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from jaxnav.configuration import configure
+from jaxnav.files.configuration import configure
 
 configure(float64=True)  # before the first array, as the commands do
 
@@ -24,11 +24,11 @@ import numpy as np  # noqa: E402
 from mrcal_lens import MISSING, installed, mrcal_lens  # noqa: E402
 from scipy.ndimage import gaussian_filter  # noqa: E402
 
-from jaxnav.calibration.boards.board import Board  # noqa: E402
-from jaxnav.calibration.lenses.images import calibrate_images  # noqa: E402
-from jaxnav.calibration.lenses.start import opencv_calibration  # noqa: E402
+from jaxnav.calibrate.board.board import Board  # noqa: E402
+from jaxnav.calibrate.lens.images import calibrate_images  # noqa: E402
+from jaxnav.calibrate.lens.start import opencv_calibration  # noqa: E402
+from jaxnav.core.models.camera import Camera  # noqa: E402
 from jaxnav.files import calib_dir, load_rig  # noqa: E402
-from jaxnav.models.camera import Camera  # noqa: E402
 from tests.helpers.board_pictures import board_pictures  # noqa: E402
 
 RIG = load_rig(calib_dir() / "qcar" / "rig.yaml")

@@ -15,16 +15,16 @@ from collections import Counter
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.compiling.step import compile_or_load
-from jaxnav.configuration import configure, step_folder
+from jaxnav.drive.compiled_step import compile_or_load
+from jaxnav.drive.estimator import advance_packed
+from jaxnav.drive.flags import Fault, names
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.loop.estimator import advance_packed
-from jaxnav.loop.flags import Fault, names
-from jaxnav.simulation.bases import BASES, IMUS, equipped
-from jaxnav.simulation.plant import OdometryNoise
-from jaxnav.testing import injections as inject
-from jaxnav.testing.faults import HEADER, FaultRow, Trial, line, run_trial
-from jaxnav.testing.matrix import matrix
+from jaxnav.files.configuration import configure, step_folder
+from jaxnav.sim.bases import BASES, IMUS, equipped
+from jaxnav.sim.plant import OdometryNoise
+from jaxnav.vehicles.conformance import injections as inject
+from jaxnav.vehicles.conformance.faults import HEADER, FaultRow, Trial, line, run_trial
+from jaxnav.vehicles.conformance.matrix import matrix
 from jaxnav.vehicles.world import WorldSettings
 
 LIES = (

@@ -19,7 +19,7 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy, as the command does
 
-from jaxnav.configuration import configure, step_folder
+from jaxnav.files.configuration import configure, step_folder
 
 configure(float64=False, threads=1)
 
@@ -30,18 +30,18 @@ import pytest  # noqa: E402
 
 from jaxnav.commands.simulate.rendered_world import SENSOR  # noqa: E402
 from jaxnav.detection import make_detector  # noqa: E402
+from jaxnav.drive.expect import expect_corners  # noqa: E402
+from jaxnav.drive.flags import Health  # noqa: E402
+from jaxnav.drive.interfaces import Frame  # noqa: E402
+from jaxnav.drive.pilot import Input  # noqa: E402
+from jaxnav.drive.seeing import Region, Search  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.loop.expect import expect_corners  # noqa: E402
-from jaxnav.loop.flags import Health  # noqa: E402
-from jaxnav.loop.interfaces import Frame  # noqa: E402
-from jaxnav.loop.pilot import Input  # noqa: E402
-from jaxnav.loop.seeing import Region, Search  # noqa: E402
-from jaxnav.recording.drive_log import read_drive  # noqa: E402
-from jaxnav.recording.drive_setup import DriveSetup  # noqa: E402
-from jaxnav.simulation.rendering import Renderer  # noqa: E402
-from jaxnav.simulation.scene import Scene  # noqa: E402
-from jaxnav.testing.faults import WAYPOINTS_M  # noqa: E402
-from jaxnav.testing.lockstep import BEGIN_NS, Rates, drive  # noqa: E402
+from jaxnav.recordings.drive_log import read_drive  # noqa: E402
+from jaxnav.recordings.drive_setup import DriveSetup  # noqa: E402
+from jaxnav.sim.rendering import Renderer  # noqa: E402
+from jaxnav.sim.scene import Scene  # noqa: E402
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M  # noqa: E402
+from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Rates, drive  # noqa: E402
 from jaxnav.vehicles.world import SimWorld  # noqa: E402
 
 DISTANCES_M = (1.0, 2.0, 3.0)  # from the front camera's lens

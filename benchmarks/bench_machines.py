@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav import configuration
+from jaxnav.files import configuration
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("JAXNAV_DATA", ROOT.parent / "shared/data")) / "tagslam"
@@ -86,8 +86,8 @@ def run_drives(made: Outcomes) -> Outcomes:
     import jax
     import jax.numpy as jnp
 
-    from jaxnav.navigator import Navigator, State
-    from jaxnav.pose.observation import Observation
+    from jaxnav.core.navigator import Navigator, State
+    from jaxnav.core.pose.observation import Observation
     from tests import worlds
 
     navigator = Navigator(worlds.qcar_rig_by_hand(), worlds.paper_markers(), worlds.qcar_by_hand())
@@ -117,9 +117,9 @@ def run_drives(made: Outcomes) -> Outcomes:
 
 def run_recording(name: str, frames: int) -> Outcomes:
     """The outcomes of a recording, (frames, markers)."""
-    from jaxnav.belief.hypotheses import MultiHypothesis
-    from jaxnav.datasets.recordings import read_recording
-    from jaxnav.datasets.replay import replay
+    from jaxnav.core.filter.hypotheses import MultiHypothesis
+    from jaxnav.recordings.other.recordings import read_recording
+    from jaxnav.recordings.other.replay import replay
 
     recording = read_recording(DATA / name).first(frames)
     told = replay(recording, MultiHypothesis(), one_at_a_time=True)

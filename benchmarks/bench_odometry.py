@@ -13,12 +13,12 @@ from collections.abc import Callable
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
-from jaxnav.calibration.odometry.model import NAMES
-from jaxnav.configuration import configure
+from jaxnav.calibrate.odometry.calibrate import OdometryCalibration, calibrate_odometry
+from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig
-from jaxnav.simulation.statistics import anees_band
+from jaxnav.files.configuration import configure
+from jaxnav.sim.statistics import anees_band
 from tests.helpers.odometry_drives import (
     RECIPE,
     START,

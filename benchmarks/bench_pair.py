@@ -27,11 +27,11 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from jaxnav.configuration import configure
-from jaxnav.models.markers import CORNER_SIGNS
-from jaxnav.pose import refine
-from jaxnav.pose.ippe import PosePair, ippe_square
-from jaxnav.pose.pair_lanes import ippe_squares, solve_pairs
+from jaxnav.core.models.markers import CORNER_SIGNS
+from jaxnav.core.pose import refine
+from jaxnav.core.pose.ippe import PosePair, ippe_square
+from jaxnav.core.pose.pair_lanes import ippe_squares, solve_pairs
+from jaxnav.files.configuration import configure
 
 SIZE_M, FOCAL_PX, ROUNDS, STEPS = 0.172, 319.0, 15, 12
 BATCH, OPENCV_LANES, GENERAL_LANES, QUALITY_LANES = 100_000, 200, 2_000, 10_000

@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from bench_detection import Find, apriltag, opencv, ours, row
 
-from jaxnav.calibration.boards.images import source_files
+from jaxnav.calibrate.board.images import source_files
 from jaxnav.commands.drive.locate import detect, detectors_for
 from jaxnav.files.images import read_image
 

@@ -15,27 +15,27 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from jaxnav.configuration import configure
+from jaxnav.files.configuration import configure
 
 configure(float64=True)  # before the first array, as the commands do
 
 import numpy as np  # noqa: E402
 from mrcal_lens import MISSING, installed, mrcal_lens  # noqa: E402
 
-from jaxnav.calibration.boards.board import Board  # noqa: E402
-from jaxnav.calibration.boards.images import collect_views  # noqa: E402
-from jaxnav.calibration.lenses import bundle as lens_bundle  # noqa: E402
-from jaxnav.calibration.lenses.intrinsics import LensCalibration, calibrate_lens  # noqa: E402
-from jaxnav.calibration.lenses.maps import (  # noqa: E402
+from jaxnav.calibrate.board.board import Board  # noqa: E402
+from jaxnav.calibrate.board.images import collect_views  # noqa: E402
+from jaxnav.calibrate.lens import bundle as lens_bundle  # noqa: E402
+from jaxnav.calibrate.lens.intrinsics import LensCalibration, calibrate_lens  # noqa: E402
+from jaxnav.calibrate.lens.maps import (  # noqa: E402
     grid_px,
     projection_difference,
     projection_sigma,
 )
-from jaxnav.calibration.lenses.start import board_poses, opencv_calibration  # noqa: E402
-from jaxnav.calibration.lenses.views import BoardViews  # noqa: E402
+from jaxnav.calibrate.lens.start import board_poses, opencv_calibration  # noqa: E402
+from jaxnav.calibrate.lens.views import BoardViews  # noqa: E402
 from jaxnav.commands.calibrate.board import read_board  # noqa: E402
+from jaxnav.core.models.camera import Camera  # noqa: E402
 from jaxnav.errors import BadInput  # noqa: E402
-from jaxnav.models.camera import Camera  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "boards"
 BOARDS = {

@@ -15,7 +15,7 @@ import os
 import time
 from pathlib import Path
 
-from jaxnav.configuration import configure
+from jaxnav.files.configuration import configure
 
 configure(float64=True)  # before the first array, as the commands do
 
@@ -24,13 +24,13 @@ import jax.numpy as jnp  # noqa: E402
 import jaxlie  # noqa: E402
 import numpy as np  # noqa: E402
 
-from jaxnav.belief.constant_velocity import ConstantVelocity  # noqa: E402
-from jaxnav.belief.selectors import make_selector  # noqa: E402
-from jaxnav.datasets.recordings import Recording, read_recording  # noqa: E402
-from jaxnav.datasets.replay import Replay, errors, replay  # noqa: E402
+from jaxnav.core.filter.constant_velocity import ConstantVelocity  # noqa: E402
+from jaxnav.core.filter.selectors import make_selector  # noqa: E402
+from jaxnav.core.models.odometry_errors import sigma_as_told  # noqa: E402
 from jaxnav.files.poses import matrix, pose_from_matrix  # noqa: E402
-from jaxnav.models.odometry_errors import sigma_as_told  # noqa: E402
-from jaxnav.ros.odometry_track import OdometryTrack  # noqa: E402
+from jaxnav.recordings.other.recordings import Recording, read_recording  # noqa: E402
+from jaxnav.recordings.other.replay import Replay, errors, replay  # noqa: E402
+from jaxnav.recordings.ros.odometry_track import OdometryTrack  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "tagslam"
 CLAIM = 1e-3  # a flip probability below it is a claim to be sure

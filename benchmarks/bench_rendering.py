@@ -8,12 +8,12 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.models.camera import Camera
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.simulation.rendering import Renderer
-from jaxnav.simulation.scene import Scene
-from jaxnav.simulation.sensor import Sensor, Shutter
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.sim.rendering import Renderer
+from jaxnav.sim.scene import Scene
+from jaxnav.sim.sensor import Sensor, Shutter
 
 R_WORLD_WALL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 T_CAMERA_VEHICLE = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0.0953], [1, 0, 0, -0.193], [0, 0, 0, 1]])

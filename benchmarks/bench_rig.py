@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--frames", type=int, default=None)
     args = parser.parse_args()
-    from jaxnav.configuration import configure
+    from jaxnav.files.configuration import configure
 
     configure(float64=True)
     if args.section == "trials":
@@ -58,8 +58,8 @@ def trials(count: int, frames: int) -> None:
     import rig_rooms
     from tqdm import trange
 
-    from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, turn_rad
+    from jaxnav.calibrate.rig.calibrate import calibrate_rig
+    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, turn_rad
 
     rig, markers = rig_rooms.qcar(), rig_rooms.room()
     path, true = rig_rooms.lemniscate(frames), Ts_vehicle_camera(rig)
@@ -106,9 +106,9 @@ def trials(count: int, frames: int) -> None:
 def branches(frames: int) -> None:
     import rig_rooms
 
-    from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
-    from jaxnav.calibration.rigs.views import both_poses, rays_camera
+    from jaxnav.calibrate.rig.calibrate import calibrate_rig
+    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
+    from jaxnav.calibrate.rig.views import both_poses, rays_camera
 
     rig, path = rig_rooms.qcar(), rig_rooms.lemniscate(frames)
     true = Ts_vehicle_camera(rig)
@@ -146,15 +146,15 @@ def rendered(frames: int) -> None:
     from scipy.interpolate import CubicSpline
     from tqdm import tqdm
 
-    from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, turn_rad
-    from jaxnav.calibration.rigs.views import RigViews
+    from jaxnav.calibrate.rig.calibrate import calibrate_rig
+    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, turn_rad
+    from jaxnav.calibrate.rig.views import RigViews
     from jaxnav.commands.simulate.rendered_world import READOUT_S, SENSOR
     from jaxnav.detection import make_detector
     from jaxnav.files.poses import pose_from_matrix
-    from jaxnav.simulation.rendering import Renderer
-    from jaxnav.simulation.scene import Scene
-    from jaxnav.simulation.sensor import Shutter
+    from jaxnav.sim.rendering import Renderer
+    from jaxnav.sim.scene import Scene
+    from jaxnav.sim.sensor import Shutter
 
     rig, room = rig_rooms.qcar(), rig_rooms.room()
     true = Ts_vehicle_camera(rig)
@@ -221,12 +221,12 @@ def tagslam() -> None:
     import jax.numpy as jnp
     import rig_rooms
 
-    from jaxnav.calibration.rigs import bundle
-    from jaxnav.calibration.rigs.calibrate import calibrate_rig
-    from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
-    from jaxnav.calibration.rigs.vehicle_frame import moved_to_places
-    from jaxnav.calibration.rigs.views import RigViews
-    from jaxnav.datasets.recordings import read_recording
+    from jaxnav.calibrate.rig import bundle
+    from jaxnav.calibrate.rig.calibrate import calibrate_rig
+    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
+    from jaxnav.calibrate.rig.vehicle_frame import moved_to_places
+    from jaxnav.calibrate.rig.views import RigViews
+    from jaxnav.recordings.other.recordings import read_recording
 
     data = Path(os.environ.get("JAXNAV_DATA", ROOT.parent / "shared" / "data")) / "tagslam"
     recording = read_recording(data / "test_5")
@@ -284,10 +284,10 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
     import jax.numpy as jnp
     import jaxlie
 
-    from jaxnav.calibration.rigs.pose_arrays import inverted, wxyz_xyz
-    from jaxnav.datasets.recordings import read_recording
+    from jaxnav.calibrate.rig.pose_arrays import inverted, wxyz_xyz
+    from jaxnav.core.models.rig import CameraRig
     from jaxnav.files import save_rig
-    from jaxnav.models.rig import CameraRig
+    from jaxnav.recordings.other.recordings import read_recording
 
     recording = read_recording(data / "test_7")
     for name, Ts in (("TagSLAM's", theirs), ("ours", Ts_vehicle_camera)):
@@ -316,7 +316,7 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
 def scale(frames: int) -> None:
     import rig_rooms
 
-    from jaxnav.calibration.rigs.calibrate import calibrate_rig
+    from jaxnav.calibrate.rig.calibrate import calibrate_rig
 
     rig, markers = rig_rooms.qcar(), rig_rooms.room()
     views = rig_rooms.views_of(rig, markers, rig_rooms.lemniscate(frames), NOISE_PX, 0)

@@ -21,9 +21,10 @@ import numpy as np
 
 from jaxnav.detection.types import Detections
 from jaxnav.files import calib_dir
-from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
-from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS, detections_message
+from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.vehicles.ros.connection import Connection
 
 FRONT_PX = np.array([[365.9, 170.4], [385.4, 168.8], [385.4, 195.1], [365.8, 195.5]])
 CAMERAS = ("front", "right", "rear", "left")

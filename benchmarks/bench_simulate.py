@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.belief.selectors import make_selector
-from jaxnav.configuration import configure
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.navigator import Navigator
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.navigator import Navigator
-from jaxnav.simulation.rollout import Rollout, nothing
-from jaxnav.simulation.scenarios import scenarios
+from jaxnav.files.configuration import configure
+from jaxnav.sim.rollout import Rollout, nothing
+from jaxnav.sim.scenarios import scenarios
 
 SELECTORS = ("paper-cost", "lowest-reprojection", "multi-hypothesis")
 FEW, MANY, ROUNDS = 256, 4096, 3

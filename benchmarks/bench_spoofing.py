@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxnav.configuration import configure, step_folder
+from jaxnav.drive.flags import Fault, Health, names
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.loop.flags import Fault, Health, names
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.testing.faults import WAYPOINTS_M
-from jaxnav.testing.lockstep import BEGIN_NS, Step, drive
+from jaxnav.files.configuration import configure, step_folder
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
+from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Step, drive
 from jaxnav.vehicles.world import SimWorld
 
 BEGIN_S, DRIVE_S = 4.0, 14.0

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from jaxnav.configuration import configure, step_folder
+from jaxnav.files.configuration import configure, step_folder
 
 configure(float64=False, threads=1)  # before the first array, as the commands do
 
@@ -33,17 +33,17 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import step_numpy as peer  # noqa: E402
 
-from jaxnav.belief.ambiguity import PaperCost, Selector  # noqa: E402
-from jaxnav.belief.hypotheses import MultiHypothesis  # noqa: E402
-from jaxnav.compiling.step import compiled_step  # noqa: E402
-from jaxnav.control import Command  # noqa: E402
+from jaxnav.core.control import Command  # noqa: E402
+from jaxnav.core.filter.ambiguity import PaperCost, Selector  # noqa: E402
+from jaxnav.core.filter.hypotheses import MultiHypothesis  # noqa: E402
+from jaxnav.core.linalg.levenberg_marquardt import KEEP_FOUND  # noqa: E402
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar  # noqa: E402
+from jaxnav.core.navigator import Navigator, State  # noqa: E402
+from jaxnav.core.pose.observation import Observation  # noqa: E402
+from jaxnav.drive.compiled_step import compiled_step  # noqa: E402
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
-from jaxnav.models.geometry import T_world_vehicle_from_planar  # noqa: E402
-from jaxnav.navigator import Navigator, State  # noqa: E402
-from jaxnav.numerics.levenberg_marquardt import KEEP_FOUND  # noqa: E402
-from jaxnav.pose.observation import Observation  # noqa: E402
-from jaxnav.simulation.corners import see  # noqa: E402
-from jaxnav.simulation.plant import CarState, move_through  # noqa: E402
+from jaxnav.sim.corners import see  # noqa: E402
+from jaxnav.sim.plant import CarState, move_through  # noqa: E402
 
 STEPS, PERIOD_S, SPEED_MPS = 20, 1 / 15, 0.3
 DRIVES = 5

@@ -38,8 +38,8 @@ from tqdm import tqdm
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from jaxnav.loop.flags import Health  # noqa: E402
-from jaxnav.recording.drive_log import read_drive  # noqa: E402
+from jaxnav.drive.flags import Health  # noqa: E402
+from jaxnav.recordings.drive_log import read_drive  # noqa: E402
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle, strangers  # noqa: E402
 from tests.helpers.dying_parent import ENDS, ENDS_WELL  # noqa: E402
 from tests.helpers.late import MAIN as MAIN_LATE  # noqa: E402

@@ -143,7 +143,7 @@ def rivals_table(out: Path) -> None:
     import jax.numpy as jnp
     from scipy.optimize import minimize
 
-    from jaxnav.tuning.descent import Smooth
+    from jaxnav.experiments.tuning.descent import Smooth
 
     objective, batch, start = _filter_loss(seeds=32)
     soft = jnp.zeros((), start.dtype)
@@ -256,16 +256,16 @@ def _print_cost(
 def _filter_loss(seeds: int) -> tuple[Any, Any, Any]:
     """The likelihood of drives, Q ten times too large and R ten times too small."""
     from jaxnav.commands.tune.arguments import TuneFilter
-    from jaxnav.configuration import configure
+    from jaxnav.files.configuration import configure
 
     configure(float64=False)
     import jax.numpy as jnp
 
     from jaxnav.commands.tune.data import read_data
     from jaxnav.commands.tune.filter import space_of
-    from jaxnav.parameters import with_parameters
-    from jaxnav.tuning.filter import FilterCost
-    from jaxnav.tuning.objective import Objective
+    from jaxnav.core.parameters import with_parameters
+    from jaxnav.experiments.tuning.filter import FilterCost
+    from jaxnav.experiments.tuning.objective import Objective
 
     args = TuneFilter(seeds=seeds, held_out_seeds=1, headless=True)
     data = read_data(args)

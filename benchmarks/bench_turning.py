@@ -22,15 +22,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jaxnav
 from benchmarks.bench_detection import row
 from jaxnav.commands.simulate.rendered_world import SENSOR, RenderedCameras
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.navigator import Navigator, Output
+from jaxnav.core.pose.observation import Observation
 from jaxnav.detection import Tracker, make_detectors
 from jaxnav.files import calib_dir, load_markers, load_rig
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.navigator import Navigator, Output
-from jaxnav.pose.observation import Observation
-from jaxnav.simulation.rendering import Renderer
-from jaxnav.simulation.scene import Scene
-from jaxnav.simulation.sensor import Shutter
+from jaxnav.sim.rendering import Renderer
+from jaxnav.sim.scene import Scene
+from jaxnav.sim.sensor import Shutter
 
 TABLE = Path(__file__).with_name("README-blur.md")
 PERIOD_S, EXPOSURE_S, READOUT_S = 1 / 30, 0.01, 0.008

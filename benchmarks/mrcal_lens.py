@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.lenses.views import BoardViews
+from jaxnav.calibrate.board.board import Board
+from jaxnav.calibrate.lens.views import BoardViews
 
 MISSING = "mrcal is not installed, its columns are left out: apt install mrcal"
 _COMMAND = "mrcal-calibrate-cameras"

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
+from jaxnav.core.models.markers import FAMILY_SIZES
 from jaxnav.detection import marker_cells
-from jaxnav.models.markers import FAMILY_SIZES
 
 FAMILY = "tag36h11"
 INK, PAPER = (0.04, 0.09), (0.75, 0.9)  # ranges of reflectance

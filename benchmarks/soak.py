@@ -18,14 +18,14 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from jaxnav.configuration import configure
+from jaxnav.core.navigator import Navigator
+from jaxnav.drive.estimator import advance_packed
+from jaxnav.drive.flags import Fault, Health
+from jaxnav.drive.pilot import Input, Pilot
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.loop.estimator import advance_packed
-from jaxnav.loop.flags import Fault, Health
-from jaxnav.loop.pilot import Input, Pilot
-from jaxnav.navigator import Navigator
-from jaxnav.testing.faults import WAYPOINTS_M
-from jaxnav.testing.lockstep import BEGIN_NS, drive
+from jaxnav.files.configuration import configure
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
+from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, drive
 from jaxnav.vehicles.world import SimWorld
 
 RECORDED_S = 20.0

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.models.markers import CORNER_SIGNS
-from jaxnav.navigator import Navigator, State
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.models.markers import CORNER_SIGNS
+from jaxnav.core.navigator import Navigator, State
 
 Array = NDArray[np.float64]
 _DUMMY_TILT = np.array([2, 3, 4])  # z, roll, pitch: what the filter does not follow

@@ -12,12 +12,12 @@ import numpy as np
 from jaxlie import SE3, SO3
 
 import jaxnav as jn
-from jaxnav.calibration.rigs.calibrate import calibrate_rig
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, matrices, turn_rad
-from jaxnav.calibration.rigs.views import RigViews
+from jaxnav.calibrate.rig.calibrate import calibrate_rig
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, matrices, turn_rad
+from jaxnav.calibrate.rig.views import RigViews
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.files import calib_dir
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.simulation.sightings import simulate_sightings
+from jaxnav.sim.sightings import simulate_sightings
 
 M, SIZE_M = 6, 0.172  # markers
 

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 
 import jaxnav as jn
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.navigator import jitted_step
 from jaxnav.files import calib_dir
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.navigator import jitted_step
-from jaxnav.simulation.corners import see
-from jaxnav.simulation.plant import CarState, OdometryNoise, move, read_odometry
+from jaxnav.sim.corners import see
+from jaxnav.sim.plant import CarState, OdometryNoise, move, read_odometry
 
 QCAR = calib_dir() / "qcar"
 PERIOD_S, NOISE_PX = 1 / 15, 0.5  # of the cameras; standard deviation of a corner's coordinate

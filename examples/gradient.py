@@ -14,7 +14,7 @@ import numpy as np
 from drive import NOISE_PX, QCAR, simulate  # examples/drive.py
 
 import jaxnav as jn
-from jaxnav.simulation.plant import CarState
+from jaxnav.sim.plant import CarState
 
 
 def main(frames: int = 20, h: float = 1e-2) -> tuple[np.ndarray, np.ndarray]:

@@ -12,8 +12,8 @@ import jaxlie
 import numpy as np
 
 import jaxnav as jn
-from jaxnav.models.geometry import rotation_error_rad
-from jaxnav.models.markers import CORNER_SIGNS
+from jaxnav.core.models.geometry import rotation_error_rad
+from jaxnav.core.models.markers import CORNER_SIGNS
 
 SIZE_M = 0.172  # side of the marker
 FOCAL_PX = 600.0

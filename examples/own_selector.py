@@ -17,8 +17,8 @@ import numpy as np
 from drive import drive, make_navigator  # examples/drive.py
 
 import jaxnav as jn
-from jaxnav.belief.ambiguity import PoseBelief
-from jaxnav.models.geometry import planar_from_T_world_vehicle, wrap_angle
+from jaxnav.core.filter.ambiguity import PoseBelief
+from jaxnav.core.models.geometry import planar_from_T_world_vehicle, wrap_angle
 
 
 class SteadyHeading(eqx.Module):

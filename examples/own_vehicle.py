@@ -1,4 +1,4 @@
-"""A vehicle of one's own, as a plug-in of the loop that drives: see `jaxnav.loop.interfaces`.
+"""A vehicle of one's own, as a plug-in of the loop that drives: see `jaxnav.drive.interfaces`.
 
     python examples/own_vehicle.py                  # does it keep what a vehicle promises?
     PYTHONPATH=examples jaxnav run --car own_vehicle:MyCar --cameras sim
@@ -11,8 +11,8 @@ import time
 from drive import QCAR, make_navigator  # examples/drive.py
 
 import jaxnav as jn
-from jaxnav.loop.interfaces import Odometry, Setup
-from jaxnav.testing import check_vehicle
+from jaxnav.drive.interfaces import Odometry, Setup
+from jaxnav.vehicles.conformance import check_vehicle
 from jaxnav.vehicles.world import SimWorld
 
 
@@ -48,7 +48,7 @@ def main() -> None:
     navigator, route = make_navigator(), jn.load_route(QCAR / "route.yaml")
     setup = Setup(navigator.rig, navigator.markers, navigator.motion.vehicle, route.start_pose)
     check_vehicle(MyCar, setup)
-    print("it keeps what jaxnav.loop.interfaces.Vehicle promises")
+    print("it keeps what jaxnav.drive.interfaces.Vehicle promises")
     car = MyCar(setup)
     for _ in range(10):
         car.write(0.1, 0.05)

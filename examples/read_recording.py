@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.loop.flags import Health
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_replay import replay_drive
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.drive.flags import Health
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_replay import replay_drive
+from jaxnav.recordings.drive_setup import DriveSetup
 
 DRIVE = Path(__file__).resolve().parents[1] / "tests" / "data" / "drives" / "plain.mcap"
 

@@ -4,7 +4,7 @@
     python examples/ten_thousand_drives.py 500 paper-cost      # fewer, with another selector
 
 A wrong start is a first pose to act upon whose heading is off by more than 20 degrees: the mirror
-image of the true one. `jaxnav.simulation.rollout.Rollout.run` runs so many drives faster, since a
+image of the true one. `jaxnav.sim.rollout.Rollout.run` runs so many drives faster, since a
 drive that has ended makes room for the next one.
 """
 
@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from drive import make_navigator  # examples/drive.py
 
-from jaxnav.belief.selectors import make_selector
-from jaxnav.models.geometry import wrap_angle
-from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scenarios import scenarios
-from jaxnav.simulation.statistics import wilson_interval
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.models.geometry import wrap_angle
+from jaxnav.sim.rollout import Rollout
+from jaxnav.sim.scenarios import scenarios
+from jaxnav.sim.statistics import wilson_interval
 
 WRONG_RAD, AT_ONCE = np.deg2rad(20.0), 500
 

@@ -14,26 +14,48 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxnav.belief.ambiguity import LowestReprojection as LowestReprojection
-    from jaxnav.belief.ambiguity import Mahalanobis as Mahalanobis
-    from jaxnav.belief.ambiguity import ObjectSpace as ObjectSpace
-    from jaxnav.belief.ambiguity import Oracle as Oracle
-    from jaxnav.belief.ambiguity import OrientationGiven as OrientationGiven
-    from jaxnav.belief.ambiguity import PaperCost as PaperCost
-    from jaxnav.belief.ambiguity import RatioTest as RatioTest
-    from jaxnav.belief.ambiguity import Selection as Selection
-    from jaxnav.belief.ambiguity import Selector as Selector
-    from jaxnav.belief.ambiguity import Ungated as Ungated
-    from jaxnav.belief.bicycle_kalman import BicycleKalman as BicycleKalman
-    from jaxnav.belief.constant_velocity import ConstantVelocity as ConstantVelocity
-    from jaxnav.belief.estimate import Belief as Belief
-    from jaxnav.belief.estimate import Estimate as Estimate
-    from jaxnav.belief.hypotheses import MultiHypothesis as MultiHypothesis
-    from jaxnav.belief.inertial_motion import InertialMotion as InertialMotion
-    from jaxnav.belief.motion import Motion as Motion
-    from jaxnav.configuration import configure as configure
-    from jaxnav.control import Command as Command
-    from jaxnav.control import Controller as Controller
+    from jaxnav.core.control import Command as Command
+    from jaxnav.core.control import Controller as Controller
+    from jaxnav.core.filter.ambiguity import LowestReprojection as LowestReprojection
+    from jaxnav.core.filter.ambiguity import Mahalanobis as Mahalanobis
+    from jaxnav.core.filter.ambiguity import ObjectSpace as ObjectSpace
+    from jaxnav.core.filter.ambiguity import Oracle as Oracle
+    from jaxnav.core.filter.ambiguity import OrientationGiven as OrientationGiven
+    from jaxnav.core.filter.ambiguity import PaperCost as PaperCost
+    from jaxnav.core.filter.ambiguity import RatioTest as RatioTest
+    from jaxnav.core.filter.ambiguity import Selection as Selection
+    from jaxnav.core.filter.ambiguity import Selector as Selector
+    from jaxnav.core.filter.ambiguity import Ungated as Ungated
+    from jaxnav.core.filter.bicycle_kalman import BicycleKalman as BicycleKalman
+    from jaxnav.core.filter.constant_velocity import ConstantVelocity as ConstantVelocity
+    from jaxnav.core.filter.estimate import Belief as Belief
+    from jaxnav.core.filter.estimate import Estimate as Estimate
+    from jaxnav.core.filter.hypotheses import MultiHypothesis as MultiHypothesis
+    from jaxnav.core.filter.inertial_motion import InertialMotion as InertialMotion
+    from jaxnav.core.filter.motion import Motion as Motion
+    from jaxnav.core.models.bicycle import Vehicle as Vehicle
+    from jaxnav.core.models.camera import Camera as Camera
+    from jaxnav.core.models.gyro import Gyro as Gyro
+    from jaxnav.core.models.markers import MarkerMap as MarkerMap
+    from jaxnav.core.models.origin import planar_in_world as planar_in_world
+    from jaxnav.core.models.origin import poses_in_world as poses_in_world
+    from jaxnav.core.models.rig import CameraRig as CameraRig
+    from jaxnav.core.models.twist_base import TwistBase as TwistBase
+    from jaxnav.core.navigator import Navigator as Navigator
+    from jaxnav.core.navigator import Output as Output
+    from jaxnav.core.navigator import State as State
+    from jaxnav.core.pose.candidates import Candidates as Candidates
+    from jaxnav.core.pose.ippe import PosePair as PosePair
+    from jaxnav.core.pose.ippe import ippe_square as ippe_square
+    from jaxnav.core.pose.observation import Observation as Observation
+    from jaxnav.core.pose.observation import Snapshot as Snapshot
+    from jaxnav.core.pose.refine import refine_pose as refine_pose
+    from jaxnav.core.pose.refine import solve_marker as solve_marker
+    from jaxnav.core.pose.refine import solve_markers as solve_markers
+    from jaxnav.core.pose.residuals import e1 as e1
+    from jaxnav.core.pose.residuals import e2 as e2
+    from jaxnav.core.twist_control import TwistCommand as TwistCommand
+    from jaxnav.core.twist_control import TwistController as TwistController
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
@@ -41,84 +63,62 @@ if TYPE_CHECKING:
     from jaxnav.files import load_rig as load_rig
     from jaxnav.files import load_route as load_route
     from jaxnav.files import load_vehicle as load_vehicle
-    from jaxnav.models.bicycle import Vehicle as Vehicle
-    from jaxnav.models.camera import Camera as Camera
-    from jaxnav.models.gyro import Gyro as Gyro
-    from jaxnav.models.markers import MarkerMap as MarkerMap
-    from jaxnav.models.origin import planar_in_world as planar_in_world
-    from jaxnav.models.origin import poses_in_world as poses_in_world
-    from jaxnav.models.rig import CameraRig as CameraRig
-    from jaxnav.models.twist_base import TwistBase as TwistBase
-    from jaxnav.navigator import Navigator as Navigator
-    from jaxnav.navigator import Output as Output
-    from jaxnav.navigator import State as State
-    from jaxnav.pose.candidates import Candidates as Candidates
-    from jaxnav.pose.ippe import PosePair as PosePair
-    from jaxnav.pose.ippe import ippe_square as ippe_square
-    from jaxnav.pose.observation import Observation as Observation
-    from jaxnav.pose.observation import Snapshot as Snapshot
-    from jaxnav.pose.refine import refine_pose as refine_pose
-    from jaxnav.pose.refine import solve_marker as solve_marker
-    from jaxnav.pose.refine import solve_markers as solve_markers
-    from jaxnav.pose.residuals import e1 as e1
-    from jaxnav.pose.residuals import e2 as e2
-    from jaxnav.twist_control import TwistCommand as TwistCommand
-    from jaxnav.twist_control import TwistController as TwistController
+    from jaxnav.files.configuration import configure as configure
 
     __version__: str
 
 # The imports above tell the same to type checkers; a test holds the two together.
 _MODULE_OF = {
     "BadInput": "errors",
-    "Belief": "belief.estimate",
-    "BicycleKalman": "belief.bicycle_kalman",
-    "Camera": "models.camera",
-    "CameraRig": "models.rig",
-    "Candidates": "pose.candidates",
-    "Command": "control",
-    "ConstantVelocity": "belief.constant_velocity",
-    "Controller": "control",
-    "Estimate": "belief.estimate",
-    "Gyro": "models.gyro",
-    "InertialMotion": "belief.inertial_motion",
-    "LowestReprojection": "belief.ambiguity",
-    "Mahalanobis": "belief.ambiguity",
-    "MarkerMap": "models.markers",
-    "Motion": "belief.motion",
-    "MultiHypothesis": "belief.hypotheses",
-    "Navigator": "navigator",
-    "ObjectSpace": "belief.ambiguity",
-    "Observation": "pose.observation",
-    "Oracle": "belief.ambiguity",
-    "OrientationGiven": "belief.ambiguity",
-    "Output": "navigator",
-    "PaperCost": "belief.ambiguity",
-    "PosePair": "pose.ippe",
-    "RatioTest": "belief.ambiguity",
-    "Selection": "belief.ambiguity",
-    "Selector": "belief.ambiguity",
-    "Snapshot": "pose.observation",
-    "State": "navigator",
-    "TwistBase": "models.twist_base",
-    "TwistCommand": "twist_control",
-    "TwistController": "twist_control",
-    "Ungated": "belief.ambiguity",
-    "Vehicle": "models.bicycle",
-    "configure": "configuration",
-    "e1": "pose.residuals",
-    "e2": "pose.residuals",
-    "ippe_square": "pose.ippe",
+    "Belief": "core.filter.estimate",
+    "BicycleKalman": "core.filter.bicycle_kalman",
+    "Camera": "core.models.camera",
+    "CameraRig": "core.models.rig",
+    "Candidates": "core.pose.candidates",
+    "Command": "core.control",
+    "ConstantVelocity": "core.filter.constant_velocity",
+    "Controller": "core.control",
+    "Estimate": "core.filter.estimate",
+    "Gyro": "core.models.gyro",
+    "InertialMotion": "core.filter.inertial_motion",
+    "LowestReprojection": "core.filter.ambiguity",
+    "Mahalanobis": "core.filter.ambiguity",
+    "MarkerMap": "core.models.markers",
+    "Motion": "core.filter.motion",
+    "MultiHypothesis": "core.filter.hypotheses",
+    "Navigator": "core.navigator",
+    "ObjectSpace": "core.filter.ambiguity",
+    "Observation": "core.pose.observation",
+    "Oracle": "core.filter.ambiguity",
+    "OrientationGiven": "core.filter.ambiguity",
+    "Output": "core.navigator",
+    "PaperCost": "core.filter.ambiguity",
+    "PosePair": "core.pose.ippe",
+    "RatioTest": "core.filter.ambiguity",
+    "Selection": "core.filter.ambiguity",
+    "Selector": "core.filter.ambiguity",
+    "Snapshot": "core.pose.observation",
+    "State": "core.navigator",
+    "TwistBase": "core.models.twist_base",
+    "TwistCommand": "core.twist_control",
+    "TwistController": "core.twist_control",
+    "Ungated": "core.filter.ambiguity",
+    "Vehicle": "core.models.bicycle",
+    "configure": "files.configuration",
+    "e1": "core.pose.residuals",
+    "e2": "core.pose.residuals",
+    "ippe_square": "core.pose.ippe",
     "load_camera": "files",
     "load_markers": "files",
     "load_params": "files",
     "load_rig": "files",
     "load_route": "files",
     "load_vehicle": "files",
-    "planar_in_world": "models.origin",
-    "poses_in_world": "models.origin",
-    "refine_pose": "pose.refine",
-    "solve_marker": "pose.refine",
-    "solve_markers": "pose.refine",
+    "planar_in_world": "core.models.origin",
+    "poses_in_world": "core.models.origin",
+    "refine_pose": "core.pose.refine",
+    "solve_marker": "core.pose.refine",
+    "solve_markers": "core.pose.refine",
 }
 
 __all__ = sorted(_MODULE_OF)

@@ -19,11 +19,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TextIO, cast
 
+from jaxnav.drive.output import FreeOutput, fill_descriptors
+from jaxnav.drive.signals import Interrupted, Signals
 from jaxnav.errors import EXIT_BAD_INPUT as EXIT_BAD_INPUT
 from jaxnav.errors import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from jaxnav.errors import BadInput, visible
-from jaxnav.loop.output import FreeOutput, fill_descriptors
-from jaxnav.loop.signals import Interrupted, Signals
 
 EXIT_BROKEN_PIPE = 141  # 128 + SIGPIPE
 FILES = 64  # that a drive may have open: some 30 of its own, and those of drivers

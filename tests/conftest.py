@@ -37,24 +37,16 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Tracing makes millions of small objects that are not garbage; to look for it costs a tenth.
 gc.set_threshold(1_000_000, 50, 100)
-# The pure core: folders, and what lies beside them. The hook sees what is imported after it, so
-# nothing of jaxnav may be imported above.
-CORE = [
-    f"jaxnav.{name}"
-    for name in (
-        "belief", "control", "lanes", "models", "navigator", "numerics", "parameters", "pose",
-        "timeline", "twist_control",
-    )
-]  # fmt: skip
+# The hook sees what is imported after it, so nothing of jaxnav may be imported above.
 tests.helpers.shapes.wrap_arrays_alone()
-install_import_hook(CORE, "beartype.beartype")
+install_import_hook("jaxnav.core", "beartype.beartype")
 # Elsewhere arrays alone are checked: tests put stand-ins in the place of classes. Studies send
 # objects to processes that lack the hook.
 AROUND = [
     f"jaxnav.{name}"
     for name in (
-        "calibration", "compiling", "datasets", "detection", "files", "loop", "recording",
-        "simulation", "testing", "tuning", "vehicles",
+        "calibrate", "detection", "drive", "experiments.tuning", "files", "recordings", "sim",
+        "vehicles",
     )
 ]  # fmt: skip
 install_import_hook(AROUND, "tests.helpers.shapes.check_arrays")
@@ -63,7 +55,7 @@ install_import_hook(AROUND, "tests.helpers.shapes.check_arrays")
 # small as these, nor does a second thread beside a second worker. XLA reads this when the
 # first array is made, and aborts on a flag that its version lacks.
 if "XLA_FLAGS" not in os.environ:
-    from jaxnav.configuration import FLAGS, known_flags
+    from jaxnav.files.configuration import FLAGS, known_flags
 
     quick = {
         "xla_backend_optimization_level": "0",

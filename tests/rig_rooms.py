@@ -4,15 +4,15 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.calibration.rigs.calibrate import RigCalibration
-from jaxnav.calibration.rigs.pose_arrays import inverted
-from jaxnav.calibration.rigs.views import RigViews
+from jaxnav.calibrate.rig.calibrate import RigCalibration
+from jaxnav.calibrate.rig.pose_arrays import inverted
+from jaxnav.calibrate.rig.views import RigViews
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_from_matrix
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.simulation.sightings import simulate_sightings
+from jaxnav.sim.sightings import simulate_sightings
 
 SIZE_M = 0.172
 

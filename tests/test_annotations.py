@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import pytest
 from jaxtyping import TypeCheckError
 
-from jaxnav.models.geometry import wrap_angle
-from jaxnav.navigator import Navigator
-from jaxnav.numerics.small_matrices import cholesky, log_det
-from jaxnav.simulation.plant import CarState, move
+from jaxnav.core.linalg.small_matrices import cholesky, log_det
+from jaxnav.core.models.geometry import wrap_angle
+from jaxnav.core.navigator import Navigator
+from jaxnav.sim.plant import CarState, move
 from tests import worlds
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxnav import cli, configuration
+from jaxnav import cli
+from jaxnav.files import configuration
 from jaxnav.commands import COMMANDS, names
 from jaxnav.commands.drive.arguments import Locate, ReplayRecording
 from jaxnav.commands.simulate.arguments import Demo

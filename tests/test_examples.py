@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import jaxnav as jn
-from jaxnav.loop.flags import Health
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Setup
-from jaxnav.loop.pilot import Input, Pilot
-from jaxnav.testing import check_cameras
+from jaxnav.drive.flags import Health
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Setup
+from jaxnav.drive.pilot import Input, Pilot
 from jaxnav.vehicles import sim
+from jaxnav.vehicles.conformance import check_cameras
 
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))

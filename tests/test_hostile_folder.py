@@ -14,7 +14,7 @@ NAMES = """ctypes json socket signal struct select threading multiprocessing pic
     contextlib types numpy jax jaxnav tests dask plain_car sitecustomize""".split()
 PROGRAMS = {
     "guard": """
-from jaxnav.loop.moved_vehicle import GuardProcess
+from jaxnav.drive.moved_vehicle import GuardProcess
 from tests.helpers import plain_car
 from tests.helpers.dying_parent import LIMITS, make_setup
 guarding = GuardProcess(plain_car.NAME)
@@ -34,7 +34,7 @@ process = RenderingProcess(load_rig(qcar / "rig.yaml"), load_markers(qcar / "mar
 process.close()
 """,
     "workers": """
-from jaxnav.studies.running import local_cluster
+from jaxnav.experiments.studies.running import local_cluster
 with local_cluster(1) as client:
     assert client.submit(abs, -1).result(60) == 1
 """,
@@ -70,7 +70,7 @@ def test_nothing_of_the_current_folder_is_run(tmp_path, hostile, name):
 
 def test_the_current_folder_is_handed_on_only_where_it_was_asked_for(tmp_path):
     (tmp_path / "probe.py").write_text(
-        "from jaxnav.loop.moved_vehicle import import_path; print(*import_path(), sep='\\n')"
+        "from jaxnav.drive.moved_vehicle import import_path; print(*import_path(), sep='\\n')"
     )
     command = [sys.executable, "-m", "probe"]
 

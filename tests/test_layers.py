@@ -1,7 +1,6 @@
-"""Every import in jaxnav/ is parsed and compared with the allowed arrows between layers.
+"""Every import in jaxnav/ is parsed and held against one table: which room may import which.
 
-shell -> pictures -> users -> navigator -> belief & control -> pose -> models -> numerics, never
-upward.
+A room is a folder or a file of jaxnav/. Inside `core` the arrows go one way as well.
 """
 
 import ast
@@ -11,61 +10,40 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "jaxnav"
-
-# From the bottom up. A new folder, or file beside them, must be placed here before the test passes.
-LAYERS = {
-    "numerics": {"lanes", "numerics"},
-    "models": {"models"},
-    "pose": {"pose"},
-    "belief & control": {"belief", "control", "twist_control"},
-    "navigator": {"navigator", "parameters", "timeline"},
-    "users": {
-        "calibration",
-        "compiling",
-        "datasets",
-        "detection",
-        "files",
-        "loop",
-        "recording",
-        "ros",
-        "simulation",
-        "studies",
-        "testing",
-        "tuning",
-        "vehicles",
-    },
-    "pictures": {"plots", "viewer"},
-    "shell": {"cli", "commands", "configuration"},
+# From the bottom up. A new room must be placed here before the test passes.
+MAY_IMPORT = {
+    "errors": "",
+    "core": "",
+    "files": "core errors",
+    "sim": "core errors",
+    "detection": "files core errors",
+    "experiments": "sim files core errors",
+    "drive": "detection files core errors",
+    "calibrate": "detection files core errors",
+    "recordings": "drive detection files core errors",
+    "vehicles": "recordings drive sim detection files core errors",
+    "pictures": "recordings calibrate experiments drive sim files core errors",
+    "commands": "pictures vehicles recordings calibrate drive experiments detection sim files core"
+    " errors __init__",
+    "cli": "commands drive files errors __init__",
 }
-ORDER = list(LAYERS)
-LAYER_OF = {module: layer for layer, modules in LAYERS.items() for module in modules}
-PURE_CORE = set(ORDER[: ORDER.index("users")])
-# What stands side by side in a layer: these arrows alone lead from one to another.
-SIDE_BY_SIDE = {
-    "timeline": {"navigator"},
-    "twist_control": {"control"},
-    "compiling": {"files"},
-    "detection": {"compiling"},
-    "loop": {"compiling", "detection", "files"},
-    "recording": {"compiling", "detection", "files", "loop"},
-    "ros": {"detection", "files", "loop"},
-    "datasets": {"detection", "files", "loop", "recording", "ros"},
-    "vehicles": {"compiling", "detection", "files", "loop", "recording", "ros", "simulation"},
-    "testing": {"compiling", "detection", "files", "loop", "simulation", "vehicles"},
-    "calibration": {"detection", "files"},
-    "studies": {"files", "simulation"},
-    "tuning": {"simulation"},
-    "viewer": {"plots"},
-    "cli": {"commands"},
-    "commands": {"configuration"},
+CORE = {
+    "linalg": "",
+    "lanes": "",
+    "models": "linalg",
+    "pose": "linalg models",
+    "control": "linalg models",
+    "twist_control": "linalg models control",
+    "filter": "linalg models pose",
+    "navigator": "linalg models pose control twist_control filter",
+    "parameters": "linalg models pose control twist_control filter navigator",
+    "timeline": "linalg models pose control twist_control filter navigator",
 }
-MAY_IMPORT_LANES = {"simulation", "tuning"}
-MOST_NODES, MOST_ARROWS, LONGEST_CHAIN = 30, 170, 14
-# `errors` is what the outside world gets: the pure core reports failure by value.
-ERRORS = "errors"
-PUBLIC_NAMES = "__init__"
+MAY_IMPORT_LANES = {"sim", "experiments"}
+MOST_ROOMS, MOST_ARROWS, MOST_FLOORS = 17, 80, 9
+PUBLIC_NAMES = "__init__"  # the lazy root leads everywhere, so only the shell may go through it
 
-CORE_MAY_IMPORT = {"jax", "jaxlie", "equinox", "optimistix", "jaxtyping", "numpy"} | {
+CORE_LIBRARIES = {"jax", "jaxlie", "equinox", "optimistix", "jaxtyping", "numpy"} | {
     "__future__",
     "abc",
     "collections",
@@ -78,54 +56,51 @@ CORE_MAY_IMPORT = {"jax", "jaxlie", "equinox", "optimistix", "jaxtyping", "numpy
     "math",
     "operator",
     "typing",
+    "warnings",
 }
-MAY_IMPORT_TOO = {"lanes": {"warnings"}}  # an unknown JAX makes it slow, which no value can say
 CORE_MAY_NOT_CALL = {"print", "open", "input", "exec", "eval", "breakpoint", "__import__"}
+MAY_CONFIGURE = ("cli", "commands.", "files.configuration")
 
 
 def violations(module: str, tree: ast.Module) -> list[str]:
-    """What one file does that its layer must not.
+    """What one file does that its room must not.
 
     Args:
         module: dotted path below the package, e.g. "files.rigs"; "__init__" for its root.
         tree: the parsed file.
     """
-    top = module.split(".")[0]
-    if top not in LAYER_OF and top not in (ERRORS, PUBLIC_NAMES):
-        return [f"{module} has no layer: place it in LAYERS"]
+    room, *rest = module.split(".")
+    if room not in (*MAY_IMPORT, PUBLIC_NAMES) or (
+        room == "core" and rest and rest[0] not in (*CORE, PUBLIC_NAMES)
+    ):
+        return [f"{module} has no place: put it into the table"]
     found = []
-    in_core = LAYER_OF.get(top) in PURE_CORE
     for imported, line in _imports(module, tree):
-        root, _, rest = imported.partition(".")
+        root, *inner = imported.split(".")
         if root == "jaxnav":
-            if not _may_import(top, rest.split(".")[0]):
+            if not _may_import(module, inner):
                 found.append(f"{module}:{line} imports {imported}")
-        elif in_core and root not in CORE_MAY_IMPORT | MAY_IMPORT_TOO.get(top, set()):
+        elif room == "core" and root not in CORE_LIBRARIES:
             found.append(f"{module}:{line} imports {imported}")
     for node in ast.walk(tree):
-        if in_core and isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        if room == "core" and isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             if node.func.id in CORE_MAY_NOT_CALL:
                 found.append(f"{module}:{node.lineno} calls {node.func.id}")
-    return found + list(_configurations(module, tree, forbidden_everywhere=in_core))
+    return found + list(_configurations(module, tree, forbidden_everywhere=room == "core"))
 
 
-def _may_import(top: str, target: str) -> bool:
-    """Whether the files of `top` may import `target`, both names of modules or folders."""
-    if top in (PUBLIC_NAMES, target):
+def _may_import(module: str, target: list[str]) -> bool:
+    """Whether a file may import what stands at `target`, its path below the package."""
+    room, *rest = module.split(".")
+    to = target[0] if target else PUBLIC_NAMES
+    if room == PUBLIC_NAMES:
         return True
-    if top == ERRORS:
-        return False
-    layer = LAYER_OF[top]
-    if target in (ERRORS, ""):
-        # The lazy root leads everywhere, so only the shell may go through it.
-        return layer == "shell" or (target == ERRORS and layer not in PURE_CORE)
-    if target not in LAYER_OF:
-        return False
-    if target == "lanes":
-        return top in MAY_IMPORT_LANES
-    if LAYER_OF[target] == layer:
-        return target in SIDE_BY_SIDE.get(top, set())
-    return ORDER.index(LAYER_OF[target]) < ORDER.index(layer)
+    if room == to == "core" and rest:
+        inner = target[1] if len(target) > 1 else ""
+        return inner == rest[0] or inner in CORE.get(rest[0], "").split()
+    if target[:2] == ["core", "lanes"]:
+        return room in MAY_IMPORT_LANES
+    return room == to or to in MAY_IMPORT[room].split()
 
 
 def _imports(module: str, tree: ast.Module) -> Iterator[tuple[str, int]]:
@@ -139,15 +114,15 @@ def _imports(module: str, tree: ast.Module) -> Iterator[tuple[str, int]]:
             if node.level:
                 base = folder[: len(folder) - node.level + 1] + base
             name = ".".join(base)
-            # `from jaxnav import files` imports a module; `from jaxnav import e1` the lazy root.
+            # `from jaxnav import files` imports a room; `from jaxnav import e1` the lazy root.
             for alias in node.names:
-                is_module = name == "jaxnav" and (alias.name in LAYER_OF or alias.name == ERRORS)
-                yield (f"jaxnav.{alias.name}" if is_module else name), node.lineno
+                is_place = alias.name in {"jaxnav": MAY_IMPORT, "jaxnav.core": CORE}.get(name, {})
+                yield (f"{name}.{alias.name}" if is_place else name), node.lineno
 
 
 def _configurations(module: str, tree: ast.Module, forbidden_everywhere: bool) -> Iterator[str]:
     """Uses of jax.config: in the core and on import none at all, changes only in the shell."""
-    may_change = LAYER_OF.get(module.split(".")[0]) == "shell"
+    may_change = module.startswith(MAY_CONFIGURE)
     inside_functions = {
         id(inner)
         for node in ast.walk(tree)
@@ -168,110 +143,82 @@ def _configurations(module: str, tree: ast.Module, forbidden_everywhere: bool) -
             yield f"{module}:{node.lineno} changes the global configuration"
 
 
-def _modules() -> dict[str, Path]:
-    paths = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        paths[".".join(parts)] = path
-    return paths
+def _trees() -> dict[str, ast.Module]:
+    return {
+        ".".join(path.relative_to(PACKAGE).with_suffix("").parts): ast.parse(path.read_bytes())
+        for path in sorted(PACKAGE.rglob("*.py"))
+    }
 
 
-def _arrows() -> set[tuple[str, str]]:
-    """From node to node, without those of the lazy root."""
-    arrows = set()
-    for module, path in _modules().items():
-        top = module.split(".")[0]
-        for imported, _ in _imports(module, ast.parse(path.read_text(encoding="utf-8"))):
-            target = imported.removeprefix("jaxnav.").split(".")[0]
-            if imported.startswith("jaxnav.") and top not in (target, PUBLIC_NAMES):
-                arrows.add((top, target))
-    return arrows
-
-
-@pytest.mark.parametrize("module", _modules())
-def test_imports_follow_the_arrows(module: str) -> None:
-    path = _modules()[module]
-    assert violations(module, ast.parse(path.read_text(encoding="utf-8"), str(path))) == []
-
-
-def test_every_file_was_found() -> None:
-    assert {"models.geometry", "navigator", "cli", "errors", "__init__"} <= set(_modules())
+def test_imports_follow_the_table() -> None:
+    trees = _trees()
+    assert {"core.models.geometry", "core.navigator", "cli", "errors", "__init__"} <= set(trees)
+    assert [error for module in trees for error in violations(module, trees[module])] == []
 
 
 def test_the_house_is_seen_at_a_glance() -> None:
-    """A folder, or a file beside them, is a node; printed by `pytest -s`."""
-    arrows = _arrows()
-    nodes = {name for arrow in arrows for name in arrow}
-    leads_to = {node: {b for a, b in arrows if a == node} for node in nodes}
-    depths: dict[str, int] = {}
-
-    def depth(node: str, above: tuple[str, ...] = ()) -> int:
-        assert node not in above, f"a cycle: {' -> '.join((*above, node))}"
-        if node not in depths:
-            below = [depth(other, (*above, node)) for other in leads_to[node]]
-            depths[node] = 1 + max(below, default=0)
-        return depths[node]
-
-    longest = max(map(depth, nodes))
-    for node in sorted(nodes, key=lambda node: (depths[node], node)):
-        print(f"{depths[node]:2} {node} -> {' '.join(sorted(leads_to[node]))}")
-    print(f"{len(nodes)} nodes, {len(arrows)} arrows, longest chain {longest}")
-    assert len(nodes) <= MOST_NODES
+    """Rooms and arrows, without those of the lazy root; printed by `pytest -s`."""
+    arrows = {
+        (module.split(".")[0], (*imported.split("."), PUBLIC_NAMES)[1])
+        for module, tree in _trees().items()
+        for imported, _ in _imports(module, tree)
+        if imported.split(".")[0] == "jaxnav" and module != PUBLIC_NAMES
+    }
+    arrows = {(room, to) for room, to in arrows if to not in (room, PUBLIC_NAMES)}
+    floors: dict[str, int] = {}
+    for room in MAY_IMPORT:  # from the bottom up, so a room's floor follows from those before it
+        floors[room] = 1 + max((floors[to] for one, to in arrows if one == room), default=0)
+        print(f"{floors[room]} {room} -> {' '.join(sorted(b for a, b in arrows if a == room))}")
+    print(f"{len(floors)} rooms, {len(arrows)} arrows, {max(floors.values())} floors")
+    assert len(floors) <= MOST_ROOMS
     assert len(arrows) <= MOST_ARROWS
-    assert longest <= LONGEST_CHAIN
+    assert max(floors.values()) <= MOST_FLOORS
 
 
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("numerics.trees", "from jaxnav.models.camera import Camera"),
-        ("models.geometry", "def f():\n    from jaxnav import pose"),
-        ("models.geometry", "from ..pose import ippe"),
-        ("models.camera", "from jaxnav.errors import BadInput"),
-        ("models.rig", "from jaxnav.pose.ippe import ippe_square"),
-        ("pose.ippe", "import cv2"),
-        ("pose.refine", "from time import monotonic"),
-        ("belief.kalman", "from jaxnav.navigator import Navigator"),
-        ("navigator", "from jaxnav.files import load_rig"),
-        ("navigator", "from jaxnav.lanes.over_lanes import over_lanes"),
-        ("navigator", "import jaxnav"),
-        ("navigator", "from jaxnav import load_rig"),
-        ("navigator", "print('here')"),
-        ("navigator", "def f():\n    import jax\n    return jax.config.jax_enable_x64"),
-        ("files.rigs", "from ..plots.drive import figure"),
+def test_forbidden_arrows_are_caught() -> None:
+    for module, source in [
+        ("core.linalg.trees", "from jaxnav.core.models.camera import Camera"),
+        ("core.models.geometry", "def f():\n    from jaxnav.core import pose"),
+        ("core.models.geometry", "from ..pose import ippe"),
+        ("core.models.camera", "from jaxnav.errors import BadInput"),
+        ("core.models.rig", "from jaxnav.core.pose.ippe import ippe_square"),
+        ("core.pose.ippe", "import cv2"),
+        ("core.pose.refine", "from time import monotonic"),
+        ("core.filter.kalman", "from jaxnav.core.navigator import Navigator"),
+        ("core.navigator", "from jaxnav.files import load_rig"),
+        ("core.navigator", "from jaxnav.core.lanes.over_lanes import over_lanes"),
+        ("core.navigator", "import jaxnav"),
+        ("core.navigator", "from jaxnav import load_rig"),
+        ("core.navigator", "print('here')"),
+        ("core.navigator", "def f():\n    import jax\n    return jax.config.jax_enable_x64"),
+        ("core.novelty", "import math"),
+        ("files.rigs", "from ..pictures.drive import figure"),
         ("files.rigs", "from jaxnav.detection import detect"),
-        ("detection.edges", "import jaxnav.simulation.rendering"),
-        ("loop.pilot", "from jaxnav.recording.drive_log import DriveLog"),
-        ("lanes.rules", "from jaxnav.navigator import Navigator"),
-        ("datasets.replay", "from jaxnav.simulation import rollout"),
-        ("calibration.rigs.bundle", "from jaxnav.simulation import rollout"),
-        ("simulation.plant", "import jax\njax.config.update('jax_enable_x64', True)"),
-        ("simulation.plant", "import jax\ndef f():\n    jax.config.update('jax_enable_x64', 1)"),
-        ("studies.grid", "from jax import config"),
+        ("detection.edges", "import jaxnav.sim.rendering"),
+        ("drive.pilot", "from jaxnav.recordings.drive_log import DriveLog"),
+        ("recordings.other.replay", "from jaxnav.sim import rollout"),
+        ("calibrate.rig.bundle", "from jaxnav.sim import rollout"),
+        ("sim.plant", "import jax\njax.config.update('jax_enable_x64', True)"),
+        ("sim.plant", "import jax\ndef f():\n    jax.config.update('jax_enable_x64', 1)"),
+        ("experiments.grid", "from jax import config"),
         ("commands.simulate.demo", "import jax\nX64 = jax.config.jax_enable_x64"),
-        ("errors", "from jaxnav.models.geometry import wrap_angle"),
+        ("errors", "from jaxnav.core.models.geometry import wrap_angle"),
         ("novelty", "import math"),
-    ],
-)
-def test_a_forbidden_arrow_is_caught(module: str, source: str) -> None:
-    assert len(violations(module, ast.parse(source))) == 1
+    ]:
+        assert len(violations(module, ast.parse(source))) == 1, (module, source)
 
 
 @pytest.mark.parametrize(
     ("module", "source"),
     [
-        ("navigator", "from jaxnav.models.geometry import wrap_angle\nimport jax.numpy as jnp"),
-        ("datasets.replay", "from jaxnav.files.rigs import load_rig"),
-        ("studies.grid", "from jaxnav.simulation import rollout\nimport xarray"),
-        ("tuning.driving", "from jaxnav.lanes.over_lanes import over_lanes"),
+        ("core.navigator", "from jaxnav.core.pose import ippe\nimport jax.numpy as jnp"),
+        ("recordings.other.replay", "from jaxnav.files.rigs import load_rig"),
+        ("experiments.grid", "from jaxnav.sim import rollout\nimport xarray"),
         ("files.rigs", "from .reading import read\nfrom jaxnav.errors import BadInput"),
-        (
-            "commands.simulate.demo",
-            "from jaxnav import plots\nfrom jaxnav.commands.simulate.arguments import Demo",
-        ),
+        ("commands.simulate.demo", "from jaxnav import pictures"),
         (
             "cli",
-            "from jaxnav import __version__\nimport jax\ndef f():\n    jax.config.update('a', 1)",
+            "from jaxnav import __version__\nimport jax\ndef f():\n    jax.config.update(1, 2)",
         ),
     ],
 )

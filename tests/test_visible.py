@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jaxnav.calibration.boards.images import source_files
+from jaxnav.calibrate.board.images import source_files
 from jaxnav.cli import main, nothing_hidden
 from jaxnav.commands.pictures import save_figure
 from jaxnav.errors import BadInput, Containment, visible

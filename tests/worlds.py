@@ -8,13 +8,13 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.pose.observation import Observation
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.camera import Camera
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.markers import CORNER_SIGNS, MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.pose.observation import Observation
 
 WAYPOINTS_M = [(1.30, 0.0), (0.50, 0.65)]  # the paper's route
 # Where the paper's marker is in view of exactly one and of exactly two cameras of the QCar.

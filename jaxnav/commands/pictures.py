@@ -14,11 +14,11 @@ from matplotlib.axis import Axis, Tick
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.origin import points_in_world
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path
-from jaxnav.models.camera import Camera
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.origin import points_in_world
 
 PNG_DPI = 110
 _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker

@@ -6,7 +6,7 @@ import warnings
 
 import jax
 
-from jaxnav.configuration import configure, jax_runs
+from jaxnav.files.configuration import configure, jax_runs
 
 
 def configure_jax(float64: bool, threads: int | None = None) -> None:

@@ -9,7 +9,7 @@ from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.kinds import flag_of
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
-from jaxnav.recording.drive_log import DriveLog, read_drive
+from jaxnav.recordings.drive_log import DriveLog, read_drive
 
 _PATIENCE_S = 2.0
 _LOADS = {

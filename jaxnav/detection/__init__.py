@@ -14,6 +14,7 @@ through blur, shade and what hides a part of it, with nothing decoded. Where non
 
 from collections.abc import Collection
 
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.detection.acquire import Acquirer
 from jaxnav.detection.apriltag import AprilTagDetector
 from jaxnav.detection.aruco import ArucoDetector
@@ -23,7 +24,6 @@ from jaxnav.detection.track import Target, Track, track
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector
 from jaxnav.errors import BadInput
-from jaxnav.models.markers import MarkerMap
 
 __all__ = [
     "Acquirer",
@@ -52,7 +52,7 @@ def make_detector(
 
     Args:
         backend: "aruco" (OpenCV) or "apriltag" (needs the extra of that name).
-        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.core.models.markers.FAMILY_SIZES`.
         ids: of the markers whose corners matter; those of others stay as they are decoded, which
             saves 10 ms each, and once these are read nothing is looked at again. None: all.
 

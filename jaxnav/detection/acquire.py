@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import all_cells, dictionary
 from jaxnav.detection.restore import BlurredImage, likely_motions
 from jaxnav.detection.track import Target, track
 from jaxnav.detection.tracker import detections_of
 from jaxnav.detection.types import Detections, at_scale, grey
-from jaxnav.models.camera import Camera
 
 _ENLARGE = 2
 _MOST_PIXELS = 1e6

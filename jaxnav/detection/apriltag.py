@@ -6,16 +6,16 @@ from collections.abc import Collection
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from jaxnav.detection.families import dictionary
-from jaxnav.detection.types import Detections, grey, refine_detections
-from jaxnav.errors import BadInput
-from jaxnav.models.camera import Camera
-from jaxnav.models.conventions import (
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.conventions import (
     APRILTAG_FAMILIES,
     APRILTAG_FIRST_CORNER_ON_OPENCV,
     APRILTAG_PIXEL_EDGE_PX,
     TL_TR_BR_BL,
 )
+from jaxnav.detection.families import dictionary
+from jaxnav.detection.types import Detections, grey, refine_detections
+from jaxnav.errors import BadInput
 
 _TO_OURS = TL_TR_BR_BL[APRILTAG_FIRST_CORNER_ON_OPENCV]
 _MIN_DECISION_MARGIN = 10.0  # grey levels; tags decoded from noise stay below

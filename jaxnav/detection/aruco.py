@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import frames_first, read_marker
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.types import Detections, at_scale, grey, refine_detections
-from jaxnav.models.camera import Camera
 
 # Quadrilaterals with sides in this range get a closer look.
 _CLOSER_LOOK_PX = (8.0, 150.0)

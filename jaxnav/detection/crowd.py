@@ -40,7 +40,7 @@ def thin_crowd(
 
     Args:
         image: (H, W) grey levels.
-        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.core.models.markers.FAMILY_SIZES`.
         least_perimeter_px: least perimeter of the quadrilaterals that the decoder examines.
     """
     crowd = max(_CROWD, min(1000, _CROWD * image.size // _CROWD_PIXELS))

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.compiling.executables import kept
+from jaxnav.core.linalg.small_matrices import eliminate
 from jaxnav.detection.image_model import (
     PIXEL_VARIANCE_PX2,
     beyond_paper,
@@ -39,7 +39,7 @@ from jaxnav.detection.image_model import (
     tells,
 )
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
-from jaxnav.numerics.small_matrices import eliminate
+from jaxnav.files.executables import kept
 
 PIXELS = 1024  # of one fit; unused ones are masked
 _STEPS = 20

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxnav.core.models.markers import FAMILY_SIZES, opencv_dictionary_name
 from jaxnav.errors import BadInput
-from jaxnav.models.markers import FAMILY_SIZES, opencv_dictionary_name
 
 # Of each kind of code the family that holds the smaller ones.
 LARGEST_FAMILIES = (

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxnav.core.linalg.small_matrices import eliminate
 from jaxnav.detection.paper import Numbers, blur_on_paper, generators, library, on_paper
-from jaxnav.numerics.small_matrices import eliminate
 
 PIXEL_VARIANCE_PX2 = 1 / 12  # of a square
 _MEHLER_ORDERS = 3

@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import UInt8
 
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import Detections, make_detectors
-from jaxnav.models.camera import Camera
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
 
 
 class ImageSearch:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jaxnav.compiling.executables import kept
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.edges import PIXELS
-from jaxnav.models.camera import Camera
+from jaxnav.files.executables import kept
 
 
 def rays_through(

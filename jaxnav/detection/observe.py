@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.detection.types import Detections
-from jaxnav.models.markers import MarkerMap
 
 SAME_PX = 1.0  # two detections nearer to each other than this count as one
 # Of a marker seen edge-on noise may turn the corners round, by its sigmas once in three million.

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.codes import codes_on_device
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
@@ -17,7 +18,6 @@ from jaxnav.detection.pattern_model import Unknowns
 from jaxnav.detection.pattern_program import Patch, follow_pattern
 from jaxnav.detection.refine import mean_side_px, pixels_along, scattered
 from jaxnav.detection.signs_of_life import sign
-from jaxnav.models.camera import Camera
 
 _LANES, _MOST_LANES = 512, 2048  # pixels of a fit, of one of a marker that is disturbed
 LEAST_PIXELS = 60

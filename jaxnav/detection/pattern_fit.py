@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
+from jaxnav.core.linalg.levenberg_marquardt import Move, NielsenLM, NormalEquations
+from jaxnav.core.linalg.small_matrices import eliminate
 from jaxnav.detection.image_model import Exposure, cell_disagreement, ridged, tells
 from jaxnav.detection.paper import on_paper
 from jaxnav.detection.pattern_model import (
@@ -32,8 +34,6 @@ from jaxnav.detection.pattern_model import (
     model,
     prior_of,
 )
-from jaxnav.numerics.levenberg_marquardt import Move, NielsenLM, NormalEquations
-from jaxnav.numerics.small_matrices import eliminate
 
 _WIDTH = 3.0  # of the loss, standard deviations
 # Of Gaussian noise under this loss: mean slope of the score over the mean weight, E[psi'] / E[w],

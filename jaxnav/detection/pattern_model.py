@@ -10,9 +10,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxnav.core.linalg.small_matrices import eliminate
 from jaxnav.detection.image_model import Exposure, expose, tells
 from jaxnav.detection.paper import on_paper
-from jaxnav.numerics.small_matrices import eliminate
 
 LIGHTS = 10
 UNKNOWNS = 8 + 2 + 1 + LIGHTS

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.compiling.executables import kept
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.codes import code_advantage
 from jaxnav.detection.disturbance import noise_correlation
 from jaxnav.detection.image_model import tells
@@ -17,7 +17,7 @@ from jaxnav.detection.lens import pixels_of, rays_through
 from jaxnav.detection.paper import SQUARE, corner_motion, homography, on_paper, rays_of
 from jaxnav.detection.pattern_fit import fit_pattern
 from jaxnav.detection.pattern_model import Unknowns, Window
-from jaxnav.models.camera import Camera
+from jaxnav.files.executables import kept
 
 _ZONE = 1.1  # cells around the marker that count: its white zone is one wide
 

@@ -39,7 +39,7 @@ def read_marker(
     Args:
         image: (H, W) grey levels.
         corners_px: (4, 2), clockwise from any corner, about a pixel off at most.
-        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.core.models.markers.FAMILY_SIZES`.
         lens: the lens that bends the marker's straight edges.
     """
     n = all_cells(family).shape[1]

@@ -15,13 +15,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.disturbed_fit import fit_disturbed
 from jaxnav.detection.families import codes_of, marker_cells, printed
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.patch_fit import MOST_STREAK_PX, PatchFit
 from jaxnav.detection.refine import mean_side_px, refine_corners
 from jaxnav.detection.template import best_match
-from jaxnav.models.camera import Camera
 
 _SIDES_PX = (8.0, 120.0)  # of a marker that is followed; a larger one takes too long
 _LEAST_CONTRAST = 10.0  # grey levels
@@ -41,7 +41,7 @@ class Target:
     """A marker that is expected in an image.
 
     Attributes:
-        family: one of `jaxnav.models.markers.FAMILY_SIZES`.
+        family: one of `jaxnav.core.models.markers.FAMILY_SIZES`.
         marker_id: its id.
         quads_px: (H, 4, 2), where its corners may be, TL TR BR BL: a place for each hypothesis.
         radius_px: the farthest that it may be from them.

@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.patch_fit import MOST_STREAK_PX
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.detection.track import Target, Track, track
 from jaxnav.detection.types import Detections, grey
-from jaxnav.models.camera import Camera
 
 MOST_FOLLOWED = 3  # markers of an image: each takes some milliseconds
 _MOST_DISTURBED = 1  # of them: it takes up to 90 ms

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.refine import as_decoded, refine_corners
 from jaxnav.errors import BadInput
-from jaxnav.models.camera import Camera
 
 
 @dataclass(frozen=True)

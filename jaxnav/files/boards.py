@@ -37,7 +37,7 @@ class _Own(Entry):
     """A board in our own file; its aliases are the arguments of `Board`."""
 
     def figures(self) -> dict[str, Any]:
-        """The arguments of `jaxnav.calibration.boards.board.Board`."""
+        """The arguments of `jaxnav.calibrate.board.board.Board`."""
         return self.model_dump(by_alias=True)
 
 

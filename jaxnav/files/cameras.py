@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
 from jaxnav.files.figures import CameraFigures
@@ -21,7 +22,6 @@ from jaxnav.files.matrix_cameras import (
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import RigFile, rig_left_out
 from jaxnav.files.validation import validate
-from jaxnav.models.camera import Camera
 
 ImageSizePx = tuple[int, int]  # width, height
 CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]

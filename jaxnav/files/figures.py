@@ -15,11 +15,11 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.core.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.core.models.lenses import LENSES
+from jaxnav.core.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Timing
 from jaxnav.files import poses
 from jaxnav.files.ranges import Range
-from jaxnav.models.camera import LENS_COEFFICIENTS, Camera
-from jaxnav.models.lenses import LENSES
-from jaxnav.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Timing
 
 Lens = Literal[
     "none",
@@ -38,7 +38,7 @@ class CameraFigures:
     """The figures of one camera.
 
     Attributes:
-        lens: see `jaxnav.models.camera`.
+        lens: see `jaxnav.core.models.camera`.
         focal_px: fx, fy.
         center_px: cx, cy; the centre of the top-left pixel is (0, 0).
         distortion: all coefficients of the lens, in its order.

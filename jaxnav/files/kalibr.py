@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
+from jaxnav.core.models.rig import PLACED_BY_CALIBRATION
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import CameraFigures, Lens, coefficients_problem, unread_keys
@@ -31,7 +32,6 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import yaml_text
-from jaxnav.models.rig import PLACED_BY_CALIBRATION
 
 _LENS: dict[str, Lens] = {
     "radtan": "radtan",

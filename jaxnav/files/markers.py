@@ -7,7 +7,7 @@
         corners_world_m: [[...], [...], [...], [...]]   # TL TR BR BL, as its reader sees them
 
 `T_world_marker` (4x4 or `{wxyz, xyz_m}`) may replace the corners: x right, y up, z towards the
-reader. Wherever in the world a map is, its places are exact: see `jaxnav.models.origin`.
+reader. Wherever in the world a map is, its places are exact: see `jaxnav.core.models.origin`.
 """
 
 from collections.abc import Sequence
@@ -20,6 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
+from jaxnav.core.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
+from jaxnav.core.models.origin import Origin, opposite, origin_near, poses_in_world
 from jaxnav.files import poses
 from jaxnav.files.figures import MarkerFigures
 from jaxnav.files.provenance import Calibrated
@@ -27,8 +29,6 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import plain_pose, with_provenance, written_pose
 from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, validate
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
-from jaxnav.models.origin import Origin, opposite, origin_near, poses_in_world
 
 # The most that a corner may be off the best square, in sides: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03

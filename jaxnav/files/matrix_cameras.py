@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AliasChoices, Field, field_validator, model_validator
 
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures, Lens, unread_keys
 from jaxnav.files.ranges import pinhole_problem, problem_of
@@ -33,7 +34,6 @@ from jaxnav.files.validation import (
     show_value,
 )
 from jaxnav.files.writing import Quoted, yaml_text
-from jaxnav.models.camera import LENS_COEFFICIENTS
 
 _LENS: dict[str, Lens] = {
     "plumb_bob": "radtan",

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.core.parameters import Tunable
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import show_value
-from jaxnav.parameters import Tunable
 
 _LEAST, _MOST = 1e-18, 1e9  # bounds of a number, so that float32 holds its square
 _MOST_ENTRIES = 64  # of a list, and rows of a matrix

@@ -7,9 +7,9 @@
       command: jaxnav tune drive.mcap
       loss: 0.12
 
-`jaxnav.parameters.TUNABLES` has the names, units and meanings. Parameters that are not named stay
-as they are: so a number that is infinite in a navigator is left out. Only `motion.gate_nis` may be
-`.inf`, which is no gate. The provenance is kept and shown, and decides nothing.
+`jaxnav.core.parameters.TUNABLES` has the names, units and meanings. Parameters that are not named
+stay as they are: so a number that is infinite in a navigator is left out. Only `motion.gate_nis`
+may be `.inf`, which is no gate. The provenance is kept and shown, and decides nothing.
 """
 
 import json
@@ -26,13 +26,13 @@ import yaml
 from jaxtyping import Float
 from pydantic import Field
 
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from jaxnav.errors import BadInput
 from jaxnav.files.param_values import param_array
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Entry, at, validate
 from jaxnav.files.writing import PlainDumper, atomic_write, plain_data
-from jaxnav.navigator import Navigator
-from jaxnav.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 
 _LONGEST_SHOWN = 300  # characters of a provenance in a line
 

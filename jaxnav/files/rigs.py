@@ -33,6 +33,9 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
+from jaxnav.core.models.rig import CameraRig, Timing
+from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, poses
 from jaxnav.files.figures import (
@@ -63,9 +66,6 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.models.camera import LENS_COEFFICIENTS
-from jaxnav.models.rig import CameraRig, Timing
-from jaxnav.parameters import TUNABLES
 
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
 _MOST_SIGMA_M, *_, _MOST_SIGMA_RAD = TUNABLES["rig.extrinsics_sigma"].most

@@ -1,7 +1,7 @@
 """Reading of topic maps in YAML: the topics of a ROS bag with cameras and odometry.
 
     cameras: {front: /front/detections, left: /left/image_raw}   # names as in the rig
-    odometry: /odom                # of a type in jaxnav/ros/odometry_messages.py
+    odometry: /odom                # of a type in jaxnav/recordings/ros/odometry_messages.py
     joints: {driven: [rear_left, rear_right], steered: [front], wheel_radius_m: 0.033}  # JointState
     imu: {topic: /imu, preset: consumer, T_vehicle_imu: [[1, 0, 0, 0.1], ...]}    # sensor_msgs/Imu
     corner_sigma_px: 0.3           # of detections in the bag; may be left out
@@ -21,6 +21,10 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
+from jaxnav.core.models.conventions import FirstCorner
+from jaxnav.core.models.odometry_errors import SCALE_AS_TOLD, TURN_AS_TOLD_RAD, sigma_as_told
+from jaxnav.core.models.preintegration import PRESETS, ImuNoise
+from jaxnav.core.parameters import TUNABLES
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
@@ -35,10 +39,6 @@ from jaxnav.files.validation import (
     Positive,
     validate,
 )
-from jaxnav.models.conventions import FirstCorner
-from jaxnav.models.odometry_errors import SCALE_AS_TOLD, TURN_AS_TOLD_RAD, sigma_as_told
-from jaxnav.models.preintegration import PRESETS, ImuNoise
-from jaxnav.parameters import TUNABLES
 
 
 class JointsEntry(Entry):

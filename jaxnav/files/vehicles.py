@@ -32,6 +32,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
+from jaxnav.core.models.bicycle import SENSOR_ERRORS, SENSORS_AS_TOLD, Vehicle
+from jaxnav.core.models.origin import Origin, opposite, planar_in_world, points_in_world
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files.bases import ACKERMANN, BaseFile, GyroEntry, base_data, gyro_data
 from jaxnav.files.provenance import Calibrated
@@ -50,10 +54,6 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
-from jaxnav.models.bicycle import SENSOR_ERRORS, SENSORS_AS_TOLD, Vehicle
-from jaxnav.models.origin import Origin, opposite, planar_in_world, points_in_world
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.parameters import TUNABLES
 
 _MOST_SIGMA = TUNABLES["motion.vehicle.sensor_sigma"].most
 _NO_FIGURES = ("base", "calibrated", "gyro", "resume", "sigma")

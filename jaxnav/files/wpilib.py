@@ -5,7 +5,7 @@
      "field": {"length": 16.541, "width": 8.211}}
 
 The tags are of one family and one size, and the file says neither. The field's frame, x along its
-length and z up, is our world; `jaxnav.models.conventions` has the rotation from a tag to our
+length and z up, is our world; `jaxnav.core.models.conventions` has the rotation from a tag to our
 marker.
 """
 
@@ -17,6 +17,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from jaxnav.core.models.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
+from jaxnav.core.models.markers import CORNER_SIGNS, FAMILY_SIZES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import MarkerFigures, unread_keys
@@ -30,8 +32,6 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
-from jaxnav.models.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
-from jaxnav.models.markers import CORNER_SIGNS, FAMILY_SIZES
 
 SIZE_M = 0.1651  # the black square of FIRST's tags, 6.5 inches
 FAMILY = "tag36h11"  # FIRST's since 2024

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from jaxnav.loop.interfaces import Frame
+from jaxnav.drive.interfaces import Frame
 
 _PATIENCE_S = 0.5  # time that `close` waits for a hanging driver, before it abandons the thread
 _RETRY_S = 0.25  # after an error

@@ -16,9 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from jaxnav.drive.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.errors import BadInput
 from jaxnav.files.images import open_video
-from jaxnav.loop.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxnav.drive.interfaces import Camera, Frame, Odometry, Setup, Vehicle
+from jaxnav.drive.limits import Limits, turns_by_twist
 from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import Camera, Frame, Odometry, Setup, Vehicle
-from jaxnav.loop.limits import Limits, turns_by_twist
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.options import latency_ns, whole_number
 

@@ -14,9 +14,9 @@ from multiprocessing.connection import Connection, Pipe
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxnav.loop.moved_vehicle import start_python
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.drive.moved_vehicle import start_python
 
 EXPOSURE_S = 0.005
 _SPREAD_S = 0.02  # the track covers this time before and after a stamp
@@ -65,9 +65,9 @@ class RenderingProcess:
 
 
 def _serve(connection: Connection) -> None:
-    from jaxnav.simulation.rendering import Renderer
-    from jaxnav.simulation.scene import Scene
-    from jaxnav.simulation.sensor import Sensor, Shutter
+    from jaxnav.sim.rendering import Renderer
+    from jaxnav.sim.scene import Scene
+    from jaxnav.sim.sensor import Sensor, Shutter
 
     rig, markers, seed = connection.recv()
     sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0, full_well_e=6000.0)

@@ -20,11 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.errors import BadInput
-from jaxnav.files.images import decode_image
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import (
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import (
     AnyVehicle,
     Camera,
     Frame,
@@ -33,11 +32,12 @@ from jaxnav.loop.interfaces import (
     Reading,
     Setup,
 )
-from jaxnav.loop.standing_clock import WaitingClock
-from jaxnav.models.rig import CameraRig
-from jaxnav.recording.drive_log import DriveLog, read_drive
-from jaxnav.recording.drive_replay import check_inputs, recorded_pixels
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.drive.standing_clock import WaitingClock
+from jaxnav.errors import BadInput
+from jaxnav.files.images import decode_image
+from jaxnav.recordings.drive_log import DriveLog, read_drive
+from jaxnav.recordings.drive_replay import check_inputs, recorded_pixels
+from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.vehicles.options import choice
 
 _WAITS_NS = 50_000_000  # longest wait of a reading when several came between two looks

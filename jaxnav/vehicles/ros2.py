@@ -3,8 +3,8 @@
 Options, `--option KEY=VALUE`:
 
     odometry_topic (/odom), odometry_type (nav_msgs/msg/Odometry, or another of
-        `jaxnav.ros.odometry_messages`; of a JointState also driven, steered: names of joints with
-        commas between them, and wheel_radius_m)
+        `recordings.ros.odometry_messages`; of a JointState also driven, steered: names of joints
+        with commas between them, and wheel_radius_m)
     command_topic (/drive; /cmd_vel of a base that is no car), command_type (ackermann:
         ackermann_msgs/AckermannDriveStamped whose speed is throttle * speed_per_throttle_mps, not
         of such a base; twist: geometry_msgs/Twist; none: somebody else drives)
@@ -24,8 +24,8 @@ from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import (
+from jaxnav.core.models.twists import TwistReader, twist_of
+from jaxnav.drive.interfaces import (
     MOST_TURNS,
     AnyVehicle,
     GyroReading,
@@ -33,10 +33,10 @@ from jaxnav.loop.interfaces import (
     Setup,
     reading_of,
 )
-from jaxnav.loop.limits import Command, limits_of, turns_by_twist
-from jaxnav.models.twists import TwistReader, twist_of
-from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.odometry_messages import (
+from jaxnav.drive.limits import Command, limits_of, turns_by_twist
+from jaxnav.errors import BadInput
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.odometry_messages import (
     ACKERMANN,
     IMU,
     JOINTS,
@@ -47,12 +47,13 @@ from jaxnav.ros.odometry_messages import (
     odometry,
 )
 from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.ros.connection import Connection
 
 if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from collections.abc import Mapping
 
-    from jaxnav.models.bicycle import Vehicle as VehicleModel
-    from jaxnav.models.twist_base import TwistBase
+    from jaxnav.core.models.bicycle import Vehicle as VehicleModel
+    from jaxnav.core.models.twist_base import TwistBase
 
 # Until somebody listens to the commands: what is sent before is lost, and a vehicle that hears
 # nothing is taken for one that is held fast.

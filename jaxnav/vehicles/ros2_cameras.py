@@ -15,14 +15,20 @@ import threading
 from functools import partial
 from typing import Any, get_args
 
+from jaxnav.core.models.conventions import FirstCorner
 from jaxnav.detection.types import Detections
+from jaxnav.drive.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import Camera, Frame, Setup, Vehicle
-from jaxnav.models.conventions import FirstCorner
-from jaxnav.ros.camera_messages import APRILTAG_ROS, COMPRESSED, IMAGE, detections, grey_image
-from jaxnav.ros.connection import Connection
-from jaxnav.ros.source_clock import SourceClock
+from jaxnav.recordings.ros.camera_messages import (
+    APRILTAG_ROS,
+    COMPRESSED,
+    IMAGE,
+    detections,
+    grey_image,
+)
 from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.ros.connection import Connection
+from jaxnav.vehicles.ros.source_clock import SourceClock
 
 _PREFIX = "camera."
 

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.errors import BadInput
-from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.interfaces import (
+from jaxnav.drive.corrections import Corrections
+from jaxnav.drive.interfaces import (
     AnyVehicle,
     Camera,
     Frame,
@@ -22,8 +21,9 @@ from jaxnav.loop.interfaces import (
     Odometry,
     Setup,
 )
-from jaxnav.loop.limits import limits_of
-from jaxnav.loop.standing_clock import WaitingClock
+from jaxnav.drive.limits import limits_of
+from jaxnav.drive.standing_clock import WaitingClock
+from jaxnav.errors import BadInput
 from jaxnav.vehicles.options import choice, number
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import SimWorld, WorldSettings

@@ -13,19 +13,19 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.compiling.executables import kept
-from jaxnav.control import Command
+from jaxnav.core.control import Command
+from jaxnav.core.models.bicycle import Vehicle as VehicleModel
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.gyro import Gyro
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.twist_control import TwistCommand
 from jaxnav.detection.types import Detections
-from jaxnav.loop.interfaces import GyroReading, Reading, reading_of
-from jaxnav.models.bicycle import Vehicle as VehicleModel
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.gyro import Gyro
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.simulation.corners import see
-from jaxnav.simulation.plant import BaseState, CarState, OdometryNoise, move
-from jaxnav.twist_control import TwistCommand
+from jaxnav.drive.interfaces import GyroReading, Reading, reading_of
+from jaxnav.files.executables import kept
+from jaxnav.sim.corners import see
+from jaxnav.sim.plant import BaseState, CarState, OdometryNoise, move
 
 _SUBSTEP_NS = 5_000_000
 _GYRO_NS, _GYRO_KEPT = 10_000_000, 50  # period of the gyro, and how many readings it keeps

@@ -16,11 +16,11 @@ import pytest
 import yaml
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.files import load_markers, load_rig, load_route
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.recording.drive_log import DriveLog, read_drive
-from jaxnav.simulation.rendering import Renderer
-from jaxnav.simulation.scene import Scene
+from jaxnav.recordings.drive_log import DriveLog, read_drive
+from jaxnav.sim.rendering import Renderer
+from jaxnav.sim.scene import Scene
 from tests.helpers import recorded_vehicle
 from tests.helpers.recorded_vehicle import Word, words
 from tests.helpers.strangers import Stranger, jaxnav

@@ -10,6 +10,8 @@ import jaxlie
 import numpy as np
 import pytest
 
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
 from jaxnav.detection import (
     Detections,
     make_detector,
@@ -20,8 +22,6 @@ from jaxnav.detection.lens import Lens
 from jaxnav.detection.observe import are_mirrored, double_area_px2
 from jaxnav.detection.read import read_marker
 from jaxnav.errors import BadInput
-from jaxnav.models.camera import Camera
-from jaxnav.models.markers import FAMILY_SIZES, MarkerMap
 from tests import worlds
 from tests.helpers.marker_images import Scene, random_scene, rotation
 

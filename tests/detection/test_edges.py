@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection import image_model
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.paper import blur_on_paper, generators, on_paper
 from jaxnav.detection.refine import refine_corners
-from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import Scene, random_scene, rotation
 
 FAMILY = "tag36h11"

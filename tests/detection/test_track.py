@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection import Target, Tracker, make_detector, marker_cells, patch_fit, track
 from jaxnav.detection.disturbance import (
     find_shade,
@@ -23,7 +24,6 @@ from jaxnav.detection.pattern_program import follow_pattern
 from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.template import best_match
 from jaxnav.detection.track import warm_up_fits
-from jaxnav.models.camera import Camera
 from tests.helpers.marker_images import random_scene
 from tests.helpers.other_pictures import RASTER, other_pictures
 

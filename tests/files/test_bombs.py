@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 import zarr
 
-from jaxnav.datasets import bag_readers
-from jaxnav.datasets.bags import decompress_bag, read_bag
-from jaxnav.datasets.recordings import read_recording
 from jaxnav.detection import crowd, make_detector
 from jaxnav.detection.aruco import _CLOSER_LOOK_PX, _worth_a_look
 from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import all_cells
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.errors import BadInput
+from jaxnav.experiments.studies.damage import check_sizes
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
 from jaxnav.files.images import decode_image, image_problem, read_image
 from jaxnav.files.npz import read_npz
 from jaxnav.files.reading import read_mapping
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.studies.damage import check_sizes
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.other import bag_readers
+from jaxnav.recordings.other.bags import decompress_bag, read_bag
+from jaxnav.recordings.other.recordings import read_recording
 from tests.helpers import bombs
 
 SECONDS = 10.0  # of a processor that others use too

@@ -11,10 +11,10 @@ import pytest
 import yaml
 
 from jaxnav import files
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.files.figures import CameraFigures
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import rig_text
-from jaxnav.models.camera import LENS_COEFFICIENTS
 from tests.helpers.conversions import (
     HELD,
     KALIBR,

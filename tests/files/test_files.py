@@ -15,11 +15,11 @@ import pytest
 import yaml
 
 from jaxnav import files
+from jaxnav.core.models.rig import PLACED_BY_HAND
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.images import decode_image
 from jaxnav.files.rigs import CameraSigma
-from jaxnav.models.rig import PLACED_BY_HAND
 from tests.helpers import seed_texts
 
 QCAR = files.calib_dir() / "qcar"

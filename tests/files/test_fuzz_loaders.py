@@ -25,16 +25,16 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from jaxnav.commands.drive.plot import summary_lines
-from jaxnav.datasets.recordings import Recording
+from jaxnav.drive.interfaces import Setup
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
-from jaxnav.loop.interfaces import Setup
-from jaxnav.recording.drive_format import HEADER, PROFILE, encode
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.message_schemas import MESSAGES, OUTCOME
-from jaxnav.recording.messages import input_message
-from jaxnav.recording.outcomes import outcome_message
+from jaxnav.recordings.drive_format import HEADER, PROFILE, encode
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.message_schemas import MESSAGES, OUTCOME
+from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.other.recordings import Recording
+from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.vehicles import replay
 from jaxnav.vehicles.options import number, whole_number
 from tests.helpers.drives import make_input, make_outcome

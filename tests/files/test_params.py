@@ -11,11 +11,11 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.belief.ambiguity import PaperCost, Ungated
+from jaxnav.core.filter.ambiguity import PaperCost, Ungated
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.parameters import TUNABLES, parameters_of
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, calib_dir, load_params, write_params
-from jaxnav.navigator import Navigator
-from jaxnav.parameters import TUNABLES, parameters_of
 from tests import worlds
 
 RIG, MARKERS, QCAR = worlds.qcar_rig_by_hand(), worlds.paper_markers(), worlds.qcar_by_hand()

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections, FrameIntake
+from jaxnav.drive.interfaces import Odometry
+from jaxnav.drive.pilot import Input
+from jaxnav.drive.stamps import MOST_NS, Stamps
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import RANGES, is_within, pinhole_problem, problem_of, table
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import validate
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections, FrameIntake
-from jaxnav.loop.interfaces import Odometry
-from jaxnav.loop.pilot import Input
-from jaxnav.loop.stamps import MOST_NS, Stamps
-from jaxnav.recording.drive_format import decode, encode
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.message_schemas import MESSAGES
-from jaxnav.recording.messages import input_message, input_of
+from jaxnav.recordings.drive_format import decode, encode
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.message_schemas import MESSAGES
+from jaxnav.recordings.messages import input_message, input_of
 from tests.helpers.drives import make_detections
 from tests.helpers.loader_seeds import BINARY, STRUCTURED
 from tests.helpers.simulated import make_setup

@@ -12,15 +12,15 @@ import numpy as np
 from mcap.writer import Writer
 
 from jaxnav import files
-from jaxnav.calibration.odometry.drive import Drive
+from jaxnav.calibrate.odometry.drive import Drive
 from jaxnav.detection import Detections, marker_cells
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
-from jaxnav.loop.pilot import Input
-from jaxnav.recording.drive_format import HEADER, PROFILE, encode, header_of
-from jaxnav.recording.mcap_messages import McapMessages, RecordedMessage
-from jaxnav.recording.message_schemas import MESSAGES
-from jaxnav.recording.messages import input_message
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Odometry
+from jaxnav.drive.pilot import Input
+from jaxnav.recordings.drive_format import HEADER, PROFILE, encode, header_of
+from jaxnav.recordings.mcap_messages import McapMessages, RecordedMessage
+from jaxnav.recordings.message_schemas import MESSAGES
+from jaxnav.recordings.messages import input_message
 from tests.helpers import loader_seeds as loaders
 from tests.helpers.odometry_drives import RECIPE, START, sensed, true_track
 from tests.helpers.ros_drives import TOPICS

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.boards.sheets import sheet_of
-from jaxnav.calibration.lenses.simulated_views import simulated_views
-from jaxnav.models.camera import Camera
-from jaxnav.simulation.boards import BoardRenderer
-from jaxnav.simulation.sensor import Sensor
+from jaxnav.calibrate.board.board import Board
+from jaxnav.calibrate.board.sheets import sheet_of
+from jaxnav.calibrate.lens.simulated_views import simulated_views
+from jaxnav.core.models.camera import Camera
+from jaxnav.sim.boards import BoardRenderer
+from jaxnav.sim.sensor import Sensor
 
 
 def board_pictures(

@@ -19,8 +19,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import Writer
 
-from jaxnav.recording.drive_format import header_metadata
-from jaxnav.recording.message_schemas import MESSAGES
+from jaxnav.recordings.drive_format import header_metadata
+from jaxnav.recordings.message_schemas import MESSAGES
 
 GIB = 2**30
 HUGE_PX = 30_000  # OpenCV itself refuses more than 2**30 pixels

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from jaxnav import files
 from jaxnav.commands.calibrate import convert as calibrate_convert
 from jaxnav.commands.calibrate.arguments import CalibrateConvert
+from jaxnav.core.models.lenses import LENSES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.cameras import camera_file
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.markers import MarkerFile
 from jaxnav.files.reading import read_mapping
-from jaxnav.models.lenses import LENSES
 
 QCAR = files.calib_dir() / "qcar"
 

@@ -8,19 +8,19 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.belief.bank import Bank, Rejections
-from jaxnav.belief.estimate import Belief
-from jaxnav.belief.repeats import Repeats
-from jaxnav.control import Command
+from jaxnav.core.control import Command
+from jaxnav.core.filter.bank import Bank, Rejections
+from jaxnav.core.filter.estimate import Belief
+from jaxnav.core.filter.repeats import Repeats
+from jaxnav.core.navigator import Output
+from jaxnav.core.pose.candidates import Candidates
 from jaxnav.detection.types import Detections
-from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import GyroReading, Odometry, TwistOdometry
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.navigator import Output
-from jaxnav.pose.candidates import Candidates
-from jaxnav.recording.messages import input_message
-from jaxnav.recording.outcomes import outcome_message
+from jaxnav.drive.flags import Fault, Health, Reject
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import GyroReading, Odometry, TwistOdometry
+from jaxnav.drive.pilot import Input, Outcome
+from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.outcomes import outcome_message
 
 BEGIN_NS = 5_000_000_123
 PERIOD_NS = 10_000_000

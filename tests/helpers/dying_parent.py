@@ -17,11 +17,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import Setup
-from jaxnav.loop.limits import Limits
-from jaxnav.loop.moved_vehicle import GuardProcess
-from jaxnav.loop.signals import Signals
+from jaxnav.drive.guard import Guard
+from jaxnav.drive.interfaces import Setup
+from jaxnav.drive.limits import Limits
+from jaxnav.drive.moved_vehicle import GuardProcess
+from jaxnav.drive.signals import Signals
 from tests.helpers import plain_car
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)

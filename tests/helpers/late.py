@@ -35,10 +35,10 @@ def listen() -> None:
     import jax
     import numpy as np
 
-    from jaxnav.compiling.executables import kept
-    from jaxnav.loop.guard import Guard
-    from jaxnav.loop.pilot import Pilot
-    from jaxnav.loop.seeing import Search
+    from jaxnav.drive.guard import Guard
+    from jaxnav.drive.pilot import Pilot
+    from jaxnav.drive.seeing import Search
+    from jaxnav.files.executables import kept
 
     call = kept.__call__
 

@@ -17,8 +17,10 @@ from jaxnav import files
 from jaxnav.commands.simulate import simulate
 from jaxnav.commands.simulate.arguments import Simulate
 from jaxnav.commands.study.studies import load_study, summary_of
-from jaxnav.datasets.recordings import read_recording
-from jaxnav.datasets.ros_drives import read_ros_drive
+from jaxnav.core.models.rig import CameraRig, Timing
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.parameters import parameters_of
+from jaxnav.experiments.studies.store import open_store
 from jaxnav.files.cameras import camera_file
 from jaxnav.files.images import read_image
 from jaxnav.files.markers import marker_map
@@ -26,16 +28,14 @@ from jaxnav.files.poses import pose_as_read
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.ros import load_ros
 from jaxnav.files.wpilib import layout_figures, layout_left_out
-from jaxnav.models.rig import CameraRig, Timing
-from jaxnav.navigator import Navigator
-from jaxnav.parameters import parameters_of
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.messages import input_message
-from jaxnav.recording.outcomes import outcome_message
-from jaxnav.recording.recorder import Recorder
-from jaxnav.simulation.bases import equipped
-from jaxnav.studies.store import open_store
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.other.recordings import read_recording
+from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.recorder import Recorder
+from jaxnav.sim.bases import equipped
 from tests.helpers.drives import make_base_input, make_outcome, record_drive
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import BEGIN_NS, IMU, MS, SQUARE_PX, TOPICS

@@ -7,7 +7,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.models.camera import Camera
+from jaxnav.core.models.camera import Camera
 
 SUBPIXELS = 8
 

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.calibration.odometry.drive import Drive
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.simulation.corners import see
-from jaxnav.simulation.plant import OdometryNoise
+from jaxnav.calibrate.odometry.drive import Drive
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.sim.corners import see
+from jaxnav.sim.plant import OdometryNoise
 
 STEP_S = 0.0025
 LAG_S, SERVO_RADPS, LIMIT_RAD = 0.3, 5.0, 0.5  # as the QCar's

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import yaml
 
-from jaxnav.models.camera import Camera
+from jaxnav.core.models.camera import Camera
 
 DATA = Path(__file__).parents[1] / "data/other_renderer"
 RASTER = DATA.with_name("other_rasteriser")  # `shadow` alone

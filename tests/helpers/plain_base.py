@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxnav.loop.interfaces import GyroReading, Setup, TwistOdometry
+from jaxnav.drive.interfaces import GyroReading, Setup, TwistOdometry
 
 NAME = f"{__name__}:open_vehicle"
 GYRO_NS = 5_000_000

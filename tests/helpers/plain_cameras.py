@@ -4,7 +4,7 @@ import threading
 import time
 from pathlib import Path
 
-from jaxnav.loop.interfaces import Frame, Setup
+from jaxnav.drive.interfaces import Frame, Setup
 from jaxnav.vehicles.world import SimWorld
 from tests.helpers import plain_car
 

@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.loop.interfaces import Odometry, Setup
+from jaxnav.drive.interfaces import Odometry, Setup
 from jaxnav.vehicles.qcar import Servo
 
 NAME = f"{__name__}:open_vehicle"

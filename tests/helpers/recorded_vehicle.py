@@ -5,8 +5,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.loop.interfaces import Setup
-from jaxnav.loop.limits import limits_of
+from jaxnav.drive.interfaces import Setup
+from jaxnav.drive.limits import limits_of
 from jaxnav.vehicles import sim
 from jaxnav.vehicles.world import SimWorld
 

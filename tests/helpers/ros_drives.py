@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxnav.datasets.ros_drives import read_ros_drive
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import TopicMap, load_topics
-from jaxnav.loop.pilot import Input
-from jaxnav.models.markers import MarkerMap
+from jaxnav.recordings.other.ros_drives import read_ros_drive
 from tests.helpers.ros_bags import Bag
 from tests.worlds import qcar, qcar_rig, room_markers
 

@@ -5,8 +5,8 @@ import time
 
 import numpy as np
 
-from jaxnav.loop.interfaces import Frame, Odometry, Setup
-from jaxnav.models.rig import CameraRig
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.drive.interfaces import Frame, Odometry, Setup
 from tests.worlds import paper_markers, qcar, qcar_rig
 
 FULL_THROTTLE = 0.3

@@ -4,14 +4,14 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.files import Route
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.messages import digest, input_message
-from jaxnav.recording.outcomes import outcome_message
-from jaxnav.recording.recorder import Recorder
-from jaxnav.testing.faults import WAYPOINTS_M
-from jaxnav.testing.lockstep import BEGIN_NS, Step, drive
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.messages import digest, input_message
+from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.recorder import Recorder
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
+from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Step, drive
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 

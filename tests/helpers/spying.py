@@ -6,11 +6,11 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 
-from jaxnav.control import Command
-from jaxnav.models.geometry import planar_from_T_world_vehicle
-from jaxnav.simulation.plant import OdometryNoise
-from jaxnav.simulation.rollout import Rollout, Trace
-from jaxnav.simulation.scenarios import Scenario, scenarios
+from jaxnav.core.control import Command
+from jaxnav.core.models.geometry import planar_from_T_world_vehicle
+from jaxnav.sim.plant import OdometryNoise
+from jaxnav.sim.rollout import Rollout, Trace
+from jaxnav.sim.scenarios import Scenario, scenarios
 from tests import worlds
 
 RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()

@@ -13,9 +13,9 @@ import copy
 import signal
 import threading
 
-from jaxnav.ros.camera_messages import APRILTAG_ROS
-from jaxnav.ros.connection import Connection
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS
+from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.vehicles.ros.connection import Connection
 
 CAMERAS = ("front", "right", "rear", "left")
 BACK_NS = 1_100_000_000

@@ -23,15 +23,21 @@ from array import array
 
 import numpy as np
 
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.drive.chassis import car_motion
+from jaxnav.drive.interfaces import Odometry, Setup
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
-from jaxnav.loop.chassis import car_motion
-from jaxnav.loop.interfaces import Odometry, Setup
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
-from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.lenses import CAMERA_INFO
-from jaxnav.ros.odometry_messages import ACKERMANN, IMU, NAV_ODOMETRY, TWIST_WITH_COVARIANCE
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
+from jaxnav.recordings.ros.lenses import CAMERA_INFO
+from jaxnav.recordings.ros.odometry_messages import (
+    ACKERMANN,
+    IMU,
+    NAV_ODOMETRY,
+    TWIST_WITH_COVARIANCE,
+)
 from jaxnav.vehicles import sim
+from jaxnav.vehicles.ros.connection import Connection
 
 TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
 TOPICS = {APRILTAG_ROS: "detections", IMAGE: "image_raw"}

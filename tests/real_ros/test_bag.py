@@ -5,11 +5,11 @@ import subprocess
 import numpy as np
 import pytest
 
+from jaxnav.core.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
+from jaxnav.core.models.twists import twist_of
+from jaxnav.drive.flags import Health
 from jaxnav.files import calib_dir
-from jaxnav.loop.flags import Health
-from jaxnav.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
-from jaxnav.models.twists import twist_of
-from jaxnav.recording.drive_log import read_drive
+from jaxnav.recordings.drive_log import read_drive
 from tests.helpers.ros_bags import Bag
 from tests.helpers.simulated import make_setup, simulated
 from tests.real_ros.processes import JAXNAV, ROOT, node
@@ -56,7 +56,7 @@ def test_a_bag_gives_the_states_of_a_replay(tmp_path, kind):
         with node(tmp_path, str(file), *words) as program:
             assert program.ends(240.0) == 0, program.said
             assert "ended: the bag is over" in program.said
-        heard = listener.heard["/jaxnav/pose"]
+        heard = listener.heard["/jaxnav/core/pose"]
         assert heard
         assert {one.child_frame_id for m in listener.heard["/tf"] for one in m.transforms} == {
             "base_link"

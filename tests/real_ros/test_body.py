@@ -6,12 +6,12 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.datasets.recordings import read_recording
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.detection.types import Detections
 from jaxnav.files import save_markers, save_rig
-from jaxnav.models.markers import MarkerMap
-from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
-from jaxnav.ros.connection import Connection
+from jaxnav.recordings.other.recordings import read_recording
+from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS, detections_message
+from jaxnav.vehicles.ros.connection import Connection
 from tests.real_ros.processes import JAXNAV, Program, node, until
 
 FRAMES = 150
@@ -43,7 +43,7 @@ def test_frames_played_in_real_time_give_the_poses_of_a_replay(tmp_path, data_di
         stamp_ns = stamp.sec * 10**9 + stamp.nanosec
         poses[stamp_ns] = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
 
-    player.listen("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/pose", take)
+    player.listen("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/core/pose", take)
     player.run()
     out = tmp_path / "out"
     words = ("--limit", str(FRAMES), "--corner-sigma-px", str(SIGMA_PX), "--headless")

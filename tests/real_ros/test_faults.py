@@ -1,5 +1,5 @@
 """Publishers that repeat themselves, whose stamps stand or jump, and that die, over real DDS: the
-flags and the throttle of the fault matrix (`jaxnav/testing/matrix.py`), in one drive."""
+flags and the throttle of the fault matrix (`vehicles/conformance/matrix.py`), in one drive."""
 
 import signal
 import sys
@@ -8,12 +8,12 @@ import time
 import numpy as np
 
 from jaxnav.detection.types import Detections
+from jaxnav.drive.flags import Fault, Health, names
 from jaxnav.files import calib_dir
-from jaxnav.loop.flags import Fault, Health, names
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.ros.camera_messages import APRILTAG_ROS, detections_message
-from jaxnav.ros.connection import message_type
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS, detections_message
+from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
 from tests.real_ros.processes import Program, node, sim_car, until
 from tests.real_ros.relay import CAMERAS
 from tests.real_ros.test_node_drives import (
@@ -212,7 +212,7 @@ def check_errors(listener: Listener, begin_s: float) -> None:
         begin_s: when the first fault began, on the clock of the stamps.
     """
     times_s = np.array([stamp_s(one) for one in listener.heard["/truth"]])
-    for message in listener.heard["/jaxnav/pose"]:
+    for message in listener.heard["/jaxnav/core/pose"]:
         true = listener.heard["/truth"][int(np.argmin(np.abs(times_s - stamp_s(message))))]
         error_m = (pose_of(message.pose.pose) - pose_of(true.pose))[4:6]
         covariance = np.asarray(message.pose.covariance).reshape(6, 6)[:2, :2]

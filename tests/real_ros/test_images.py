@@ -1,6 +1,6 @@
 """Pictures over real DDS: the node searches them itself, and localises."""
 
-from jaxnav.ros.camera_messages import IMAGE
+from jaxnav.recordings.ros.camera_messages import IMAGE
 from tests.real_ros.processes import node, sim_car, until
 from tests.real_ros.sim_car import TOPICS
 from tests.real_ros.test_node_drives import (

@@ -2,7 +2,8 @@
 
 import pytest
 
-from jaxnav.ros.connection import Connection, message_type
+from jaxnav.recordings.ros import message_type
+from jaxnav.vehicles.ros.connection import Connection
 from tests.real_ros.processes import node, until
 from tests.real_ros.test_node_drives import write_file
 

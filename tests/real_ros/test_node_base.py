@@ -8,14 +8,15 @@ import time
 import numpy as np
 import pytest
 
+from jaxnav.drive.interfaces import Setup, TwistOdometry
 from jaxnav.errors import BadInput
 from jaxnav.files import load_vehicle
-from jaxnav.loop.interfaces import Setup, TwistOdometry
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.ros.camera_messages import APRILTAG_ROS
-from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.odometry_messages import IMU, NAV_ODOMETRY, TWIST, TWIST_WITH_COVARIANCE
-from jaxnav.testing import check_vehicle
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS
+from jaxnav.recordings.ros.odometry_messages import IMU, NAV_ODOMETRY, TWIST, TWIST_WITH_COVARIANCE
+from jaxnav.vehicles.conformance import check_vehicle
+from jaxnav.vehicles.ros.connection import Connection
 from jaxnav.vehicles.ros2 import open_vehicle
 from tests.real_ros.processes import node, sim_car, until
 from tests.real_ros.sim_car import TOPICS, topic_of

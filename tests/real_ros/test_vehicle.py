@@ -8,15 +8,16 @@ from collections.abc import Iterator
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.odometry_messages import (
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.odometry_messages import (
     ACKERMANN,
     JOINTS,
     NAV_ODOMETRY,
     TWIST,
     TWIST_WITH_COVARIANCE,
 )
-from jaxnav.testing import check_vehicle
+from jaxnav.vehicles.conformance import check_vehicle
+from jaxnav.vehicles.ros.connection import Connection
 from jaxnav.vehicles.ros2 import open_vehicle
 from tests.helpers.setups import setup_with
 from tests.real_ros.processes import until

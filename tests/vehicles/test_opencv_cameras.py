@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
+from jaxnav.drive.interfaces import Frame
 from jaxnav.errors import BadInput
-from jaxnav.loop.interfaces import Frame
-from jaxnav.testing import check_cameras
 from jaxnav.vehicles import opencv_cameras
+from jaxnav.vehicles.conformance import check_cameras
 from jaxnav.vehicles.grabber import Grabber
 from jaxnav.vehicles.opencv_cameras import open_cameras
 from tests.helpers.setups import setup_with

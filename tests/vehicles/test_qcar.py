@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxnav.drive.limits import Limits
+from jaxnav.drive.plugins import open_cameras as open_by_name
+from jaxnav.drive.plugins import open_vehicle as open_vehicle_by_name
 from jaxnav.errors import BadInput
-from jaxnav.loop.limits import Limits
-from jaxnav.loop.plugins import open_cameras as open_by_name
-from jaxnav.loop.plugins import open_vehicle as open_vehicle_by_name
-from jaxnav.testing import check_cameras, check_vehicle
+from jaxnav.vehicles.conformance import check_cameras, check_vehicle
 from jaxnav.vehicles.qcar import QCarVehicle, Servo, open_cameras, open_vehicle
 from tests.helpers.fake_pal import Hardware, fake_pal
 from tests.helpers.setups import setup_with

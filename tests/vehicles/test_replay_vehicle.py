@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from jaxnav import cli
+from jaxnav.core.models.gyro import GYROS
+from jaxnav.core.models.rig import PLACED_BY_HAND
+from jaxnav.core.models.twist_base import TwistBase
 from jaxnav.detection.types import Detections
-from jaxnav.errors import BadInput
-from jaxnav.files import save_rig
-from jaxnav.loop.flags import Fault, Health
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import (
+from jaxnav.drive.flags import Fault, Health
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import (
     Ending,
     GyroReading,
     HasOwnFiles,
@@ -21,17 +22,16 @@ from jaxnav.loop.interfaces import (
     TwistOdometry,
     Vehicle,
 )
-from jaxnav.loop.pilot import Input
-from jaxnav.models.gyro import GYROS
-from jaxnav.models.rig import PLACED_BY_HAND
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_replay import first_difference, replay_drive
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.messages import input_message
-from jaxnav.recording.outcomes import Outcomes
-from jaxnav.recording.recorder import Recorder
-from jaxnav.testing import check_cameras, check_vehicle
+from jaxnav.drive.pilot import Input
+from jaxnav.errors import BadInput
+from jaxnav.files import save_rig
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_replay import first_difference, replay_drive
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.recorder import Recorder
+from jaxnav.vehicles.conformance import check_cameras, check_vehicle
 from jaxnav.vehicles.replay import ReplayVehicle, open_cameras
 from tests.helpers.drives import BEGIN_NS, make_detections, make_picture
 from tests.helpers.setups import GoodVehicle, setup_with
@@ -125,7 +125,7 @@ class Now:
 @pytest.fixture
 def now(monkeypatch) -> Now:
     now = Now()
-    monkeypatch.setattr("jaxnav.loop.standing_clock.time", now)
+    monkeypatch.setattr("jaxnav.drive.standing_clock.time", now)
     return now
 
 

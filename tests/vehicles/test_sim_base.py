@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from jaxnav.loop.interfaces import TwistOdometry
-from jaxnav.models.gyro import Gyro
-from jaxnav.models.twist_base import TwistBase
+from jaxnav.core.models.gyro import Gyro
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.drive.interfaces import TwistOdometry
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 

@@ -9,23 +9,23 @@ from jaxnav.commands.calibrate.arguments import CalibrateAdopt
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
+from jaxnav.core.models.bicycle import SENSOR_ERRORS
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.files.provenance import calibrated_now
 from jaxnav.files.vehicles import as_car
 from jaxnav.files.writing import atomic_write_all
-from jaxnav.models.bicycle import SENSOR_ERRORS
-from jaxnav.plots.learnt import learnt_over_time
-from jaxnav.recording.adoption import (
+from jaxnav.pictures.learnt import learnt_over_time
+from jaxnav.recordings.adoption import (
     NEVER_SURE,
     NOTHING_KEPT,
     adopted_files,
     is_other_rig,
     is_other_vehicle,
 )
-from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.learnt import Learnt
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.learnt import Learnt
 
 
 def run(args: CalibrateAdopt) -> int:

@@ -6,16 +6,16 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jaxnav import __version__
-from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.boards.pages import PAPERS_MM, check_fit, largest
-from jaxnav.calibration.boards.sheets import sheet_of
+from jaxnav.calibrate.board.board import Board
+from jaxnav.calibrate.board.pages import PAPERS_MM, check_fit, largest
+from jaxnav.calibrate.board.sheets import sheet_of
 from jaxnav.commands.calibrate.arguments import CalibrateBoard
 from jaxnav.commands.process import configure_jax
+from jaxnav.core.models.markers import FAMILY_SIZES
 from jaxnav.detection import marker_cells
 from jaxnav.errors import BadInput
 from jaxnav.files import atomic_path, boards, output_folder, write_json
-from jaxnav.models.markers import FAMILY_SIZES
-from jaxnav.plots.board import board_page
+from jaxnav.pictures.board import board_page
 
 # Longer and shorter side, in squares or tags.
 _GRIDS = {"charuco": (9, 6), "aprilgrid": (6, 4), "chessboard": (10, 7), "marker": (1, 1)}

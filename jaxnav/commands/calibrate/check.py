@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.calibration.rigs.calibrate import calibrate_rig
-from jaxnav.calibration.rigs.marker_check import Check, Verdict, checked
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
-from jaxnav.calibration.rigs.vehicle_frame import moved_world
+from jaxnav.calibrate.rig.calibrate import calibrate_rig
+from jaxnav.calibrate.rig.marker_check import Check, Verdict, checked
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.vehicle_frame import moved_world
 from jaxnav.commands.calibrate.arguments import CalibrateCheck as Arguments
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import provenance, summary, write_files
@@ -15,7 +15,7 @@ from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
-from jaxnav.plots.rig import map_check
+from jaxnav.pictures.rig import map_check
 
 EXIT_WRONG = 1
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.calibration.lenses.maps import ImageMap, projection_difference
+from jaxnav.calibrate.lens.maps import ImageMap, projection_difference
 from jaxnav.commands.calibrate.arguments import CalibrateCompare
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
@@ -14,7 +14,7 @@ from jaxnav.files import output_folder, write_json
 from jaxnav.files.cameras import camera_file
 from jaxnav.files.figures import CameraFigures
 from jaxnav.files.reading import read_mapping
-from jaxnav.plots.lens import comparison
+from jaxnav.pictures.lens import comparison
 
 
 def run(args: CalibrateCompare) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jaxnav.commands.calibrate.arguments import CalibrateConvert
+from jaxnav.core.models.rig import UNKNOWN_TIMING
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, wpilib
 from jaxnav.files.cameras import camera_file, choose_camera
@@ -17,7 +18,6 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import place, rig_text
 from jaxnav.files.validation import validate
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting
-from jaxnav.models.rig import UNKNOWN_TIMING
 
 _MANY: dict[str, Callable[[Sequence[CameraFigures]], str]] = {
     "jaxnav": rig_text,

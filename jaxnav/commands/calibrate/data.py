@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.calibration.rigs.views import RigViews
-from jaxnav.datasets.sightings import RecordedSightings, read_sightings
+from jaxnav.calibrate.rig.views import RigViews
+from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
-from jaxnav.models.markers import FAMILY_SIZES, MarkerMap
-from jaxnav.models.rig import CameraRig
+from jaxnav.recordings.other.sightings import RecordedSightings, read_sightings
 
 _LEAST_SIGHTINGS = 3  # of a marker that is in no map
 _APART_NS = 10**12  # between recordings

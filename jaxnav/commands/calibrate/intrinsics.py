@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 
 from jaxnav import __version__
-from jaxnav.calibration.boards.images import CollectedViews
-from jaxnav.calibration.lenses.checks import cells, reach, rim_sigma_px, tilts_deg
-from jaxnav.calibration.lenses.images import calibrate_images
-from jaxnav.calibration.lenses.intrinsics import LensCalibration
+from jaxnav.calibrate.board.images import CollectedViews
+from jaxnav.calibrate.lens.checks import cells, reach, rim_sigma_px, tilts_deg
+from jaxnav.calibrate.lens.images import calibrate_images
+from jaxnav.calibrate.lens.intrinsics import LensCalibration
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
@@ -30,8 +31,7 @@ from jaxnav.files.rigs import (
     save_rig,
 )
 from jaxnav.files.validation import validate
-from jaxnav.models.camera import LENS_COEFFICIENTS
-from jaxnav.plots.lens import lens_report
+from jaxnav.pictures.lens import lens_report
 
 # The yaw of a camera with such a name, until its place is measured.
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "rear": 180.0, "back": 180.0, "right": -90.0}

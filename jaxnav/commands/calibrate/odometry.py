@@ -8,19 +8,19 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.calibration.odometry.calibrate import OdometryCalibration, calibrate_odometry
-from jaxnav.calibration.odometry.model import NAMES
+from jaxnav.calibrate.odometry.calibrate import OdometryCalibration, calibrate_odometry
+from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.origin import planar_in_world
 from jaxnav.errors import visible
 from jaxnav.files import output_folder, save_vehicle, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.origin import planar_in_world
-from jaxnav.plots.odometry import odometry_report
+from jaxnav.pictures.odometry import odometry_report
 
 
 def run(args: Arguments) -> int:

@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.calibration.odometry.drive import Drive
+from jaxnav.calibrate.odometry.drive import Drive
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.reading import given_files, read_shown
-from jaxnav.datasets.recording import check_winding
-from jaxnav.datasets.ros_drives import read_ros_drive
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
+from jaxnav.drive.interfaces import Odometry
+from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import load_topics
 from jaxnav.files.ranges import is_within
 from jaxnav.files.vehicles import as_car
-from jaxnav.loop.interfaces import Odometry
-from jaxnav.loop.pilot import Input
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.other.recording import check_winding
+from jaxnav.recordings.other.ros_drives import read_ros_drive
 
 _NONE = Detections.concatenate([])
 _SHARED = ("rig", "markers", "vehicle")  # header keys that must agree in all recordings

@@ -10,18 +10,18 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 import jaxnav
-from jaxnav.calibration.rigs.calibrate import RigCalibration
-from jaxnav.calibration.rigs.pose_arrays import inverted, turn_rad
+from jaxnav.calibrate.rig.calibrate import RigCalibration
+from jaxnav.calibrate.rig.pose_arrays import inverted, turn_rad
 from jaxnav.commands.calibrate.data import RigData
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.origin import poses_in_world
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.files import save_markers, save_rig, write_tum
 from jaxnav.files.markers import MarkerSigma, marker_map
 from jaxnav.files.poses import pose_from_matrix
 from jaxnav.files.provenance import Calibrated, calibrated_now
 from jaxnav.files.rigs import CameraSigma
-from jaxnav.models.camera import LENS_COEFFICIENTS
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.origin import poses_in_world
-from jaxnav.models.rig import CameraRig
 
 # Good enough for driving: half a degree moves the car 3 cm sideways at 3 m from a marker.
 _WELL_M, _WELL_DEG = 0.005, 0.2

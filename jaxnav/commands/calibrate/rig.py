@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.calibration.rigs.calibrate import RigCalibration, calibrate_rig
-from jaxnav.calibration.rigs.driven_frame import driven_frame
-from jaxnav.calibration.rigs.marker_check import sizes_m
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
-from jaxnav.calibration.rigs.vehicle_frame import moved_to_driven, moved_to_places
+from jaxnav.calibrate.rig.calibrate import RigCalibration, calibrate_rig
+from jaxnav.calibrate.rig.driven_frame import driven_frame
+from jaxnav.calibrate.rig.marker_check import sizes_m
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.vehicle_frame import moved_to_driven, moved_to_places
 from jaxnav.commands.calibrate.arguments import CalibrateRig as Arguments
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import (
@@ -23,7 +23,7 @@ from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_car, output_folder, write_json
-from jaxnav.plots.rig import rig_report
+from jaxnav.pictures.rig import rig_report
 
 _WRONG_SCALE = 3.0  # ratio of found to given distances between cameras
 _WRONG_SIZE = 1.5  # ratio of a marker's found to its given size

@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, said, warning
-from jaxnav.loop.interfaces import Camera, Frame
-from jaxnav.testing.calls import Finish, start_call
+from jaxnav.drive.interfaces import Camera, Frame
+from jaxnav.vehicles.conformance.calls import Finish, start_call
 
 WATCH_S = 1.0
 _PATIENCE_S = 3.0  # until the first picture must have come

@@ -97,7 +97,7 @@ def _cache(patient: SimpleNamespace) -> Iterable[Finding]:
     """Report whether the program that a car runs with these files is compiled."""
     import jax
 
-    from jaxnav.configuration import cache_refused, step_folder
+    from jaxnav.files.configuration import cache_refused, step_folder
 
     folder, compiled = step_folder(), None
     if folder is not None and None not in vars(patient).values():
@@ -114,9 +114,9 @@ def _is_compiled(patient: SimpleNamespace, folder: Path) -> bool:
     import jax.numpy as jnp
     import numpy as np
 
-    from jaxnav.compiling.step import is_compiled
-    from jaxnav.loop.estimator import Estimator, advance_packed
-    from jaxnav.navigator import Navigator
+    from jaxnav.core.navigator import Navigator
+    from jaxnav.drive.compiled_step import is_compiled
+    from jaxnav.drive.estimator import Estimator, advance_packed
 
     with jax.enable_x64(False):
         rig, markers, vehicle = jax.tree.map(
@@ -157,7 +157,7 @@ def _plug_ins(report: Report, args: Doctor, patient: SimpleNamespace) -> Iterabl
     if None in vars(patient).values():
         return [note("not opened: they need all four files")]
     from jaxnav.commands.doctor.plug_ins import plug_ins
-    from jaxnav.loop.interfaces import Setup
+    from jaxnav.drive.interfaces import Setup
 
     options = key_values("--option", args.option)
     setup = Setup(

@@ -20,11 +20,11 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
 from jaxnav.commands.doctor.sight import area_px2
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.pose.candidates import both_poses
+from jaxnav.core.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, sightings
 from jaxnav.detection.observe import CornerLanes
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.pose.candidates import both_poses
-from jaxnav.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, sightings
 
 SIZE_SIGMA = 0.3  # of a logarithm
 _FOCAL_SIGMA = 0.1

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
-from jaxnav.models.markers import MarkerMap
 
 _MAX_ERROR = 0.01  # of a side: a careful tape's error
 _UPRIGHT = 0.3  # the normal's vertical part, below which a marker hangs on a wall

@@ -26,12 +26,12 @@ from jaxnav.commands.doctor.fits import (
     poses_by_each,
 )
 from jaxnav.commands.doctor.sight import area_px2
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.origin import Origin
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import Detections, make_detectors, observe
 from jaxnav.files import Route
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.origin import Origin
-from jaxnav.models.rig import CameraRig
 
 _MOST_MARKERS = 6  # the largest ones, which are compared
 _LEAST_PX = 12.0  # width of a marker that is found

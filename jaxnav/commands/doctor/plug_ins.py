@@ -9,15 +9,15 @@ from typing import Any
 
 from jaxnav.commands.doctor.camera_frames import judge_cameras, watch
 from jaxnav.commands.doctor.findings import Finding, Report, error, ok, said, warning
+from jaxnav.drive import plugins
+from jaxnav.drive.chassis import Chassis, chassis_of, pace_mps
+from jaxnav.drive.interfaces import AnyVehicle, Odometry, Setup
+from jaxnav.drive.interfaces import Reading as Read
+from jaxnav.drive.limits import Limits
+from jaxnav.drive.moved_vehicle import GuardProcess
 from jaxnav.errors import BadInput
-from jaxnav.loop import plugins
-from jaxnav.loop.chassis import Chassis, chassis_of, pace_mps
-from jaxnav.loop.interfaces import AnyVehicle, Odometry, Setup
-from jaxnav.loop.interfaces import Reading as Read
-from jaxnav.loop.limits import Limits
-from jaxnav.loop.moved_vehicle import GuardProcess
-from jaxnav.testing.calls import HANGS_S, Worker, start_call
-from jaxnav.testing.cameras import Parked
+from jaxnav.vehicles.conformance.calls import HANGS_S, Worker, start_call
+from jaxnav.vehicles.conformance.cameras import Parked
 
 READINGS = 20
 _PAUSE_S = 0.01

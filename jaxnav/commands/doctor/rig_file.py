@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import sees_directions, through_lens
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.files.reading import read_mapping
-from jaxnav.models.rig import CameraRig
 
 _LEAST_HEIGHT_M, _MOST_HEIGHT_M = 0.01, 2.5
 _MOST_DISTANCE_M = 4.0  # from the middle of the vehicle: a van

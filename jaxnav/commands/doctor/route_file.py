@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import PoseViews, views
+from jaxnav.core.models.bicycle import Vehicle, curvature_per_m
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.twist_base import TwistBase
 from jaxnav.files import Route
-from jaxnav.models.bicycle import Vehicle, curvature_per_m
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.models.twist_base import TwistBase
 
 READABLE_PX = 12.0  # a marker this wide is read in every second picture of a car at rest
 _ALONG = 48  # poses along the route from which views are computed

@@ -8,11 +8,11 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera
-from jaxnav.models.camera import Camera
-from jaxnav.models.geometry import T_world_vehicle_from_planar, transform_points
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
 
 _SAME_RAY = 1e-3  # between a ray and the ray of its pixel, where the lens is one-to-one
 _PIXELS = 256  # in each call, so that the program is compiled once

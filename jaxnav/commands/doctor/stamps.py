@@ -5,9 +5,9 @@ from pathlib import Path
 
 from jaxnav.commands.doctor.findings import Finding, note, ok, warning
 from jaxnav.commands.drive.delay_watch import delays_of, describe_delay, warnings
-from jaxnav.loop.camera_delays import HARMLESS_S
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.drive.camera_delays import HARMLESS_S
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
 
 _DRIVE_EIGHTS = "drive eights, or stop and start, with a marker in view of it"
 

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxnav.core.models.origin import opposite, planar_in_world
+from jaxnav.drive.camera_delays import CameraDelays, Delay
+from jaxnav.drive.chassis import chassis_of
+from jaxnav.drive.corrections import Corrections
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections, FrameIntake
+from jaxnav.drive.interfaces import Frame, Odometry
+from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import Containment
-from jaxnav.loop.camera_delays import CameraDelays, Delay
-from jaxnav.loop.chassis import chassis_of
-from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections, FrameIntake
-from jaxnav.loop.interfaces import Frame, Odometry
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.models.origin import opposite, planar_in_world
-from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.drive_setup import DriveSetup
 
 # The compiler can't be interrupted, and the vehicle already stands.
 _CLOSE_S = 20.0

@@ -5,11 +5,11 @@ from dataclasses import asdict
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Faults
 from jaxnav.commands.process import configure_jax
+from jaxnav.drive.flags import names
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
-from jaxnav.loop.flags import names
-from jaxnav.testing.faults import HEADER, Result, Trial, line, run_trial
-from jaxnav.testing.matrix import matrix
+from jaxnav.vehicles.conformance.faults import HEADER, Result, Trial, line, run_trial
+from jaxnav.vehicles.conformance.matrix import matrix
 
 EXIT_BROKEN = 1
 

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 
 import jax
 
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Frame
+from jaxnav.drive.pilot import Input, Outcome
+from jaxnav.drive.seeing import Search
 from jaxnav.errors import visible
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.loop.seeing import Search
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.learnt import Learnt, errors_of, repeated_share
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.learnt import Learnt, errors_of, repeated_share
 
 _PERIOD_NS = 2_000_000_000
 _WIDTH = 100  # characters, over what the status line leaves

@@ -11,23 +11,23 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.belief.ambiguity import LowestReprojection
-from jaxnav.belief.constant_velocity import ConstantVelocity
 from jaxnav.commands.drive.arguments import Locate
 from jaxnav.commands.drive.locate_notes import notes
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.core.filter.ambiguity import LowestReprojection
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
 from jaxnav.detection.acquire import acquire_in_photograph
 from jaxnav.errors import BadInput
 from jaxnav.files.cameras import load_figures
 from jaxnav.files.images import read_photograph
-from jaxnav.models.camera import Camera
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.plots.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
-from jaxnav.pose.candidates import Candidates, find_candidates
-from jaxnav.pose.observation import Observation, Snapshot
+from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 
 _FREEDOM = 2  # of a marker's eight numbers: a pose has six
 _CLOSER_LOOKS = 400

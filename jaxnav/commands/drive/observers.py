@@ -15,22 +15,22 @@ import numpy as np
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.learnt_watch import LearntWatch
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.origin import ZERO
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Frame
+from jaxnav.drive.loop import Observer
+from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import Containment
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.loop import Observer
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.origin import ZERO
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.messages import digest, input_message
-from jaxnav.recording.outcomes import outcome_message
-from jaxnav.recording.recorder import Recorder
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.message_schemas import OUTCOME
+from jaxnav.recordings.messages import digest, input_message
+from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.recorder import Recorder
 
 if TYPE_CHECKING:
-    from jaxnav.viewer.rerun_view import RerunView
+    from jaxnav.pictures.rerun.view import RerunView
 
 WIDTH = 100  # characters, at most
 _WIDEST_NAME = 14  # of a health
@@ -70,7 +70,7 @@ def open_onlookers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Onl
     if args.record is not None:
         add(DriveRecorder(args.record, setup, args.record_images))
     if args.view:
-        from jaxnav.viewer.rerun_view import RerunView  # imports all that draws
+        from jaxnav.pictures.rerun.view import RerunView  # imports all that draws
 
         waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
         add(LiveView(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))

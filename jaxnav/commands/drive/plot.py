@@ -9,14 +9,14 @@ import numpy as np
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.study.arguments import Plot as Arguments
+from jaxnav.drive.flags import Fault, Health, Reject
+from jaxnav.drive.interfaces import Odometry, Reading
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
 from jaxnav.files.ranges import is_within
-from jaxnav.loop.flags import Fault, Health, Reject
-from jaxnav.loop.interfaces import Odometry, Reading
-from jaxnav.plots.drive import drive_log_report
-from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.plausible import keep_plausible, left_out_note
+from jaxnav.pictures.drive import drive_log_report
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.plausible import keep_plausible, left_out_note
 
 _LONGEST_STEP_S = 1.0  # between two readings, for the distance; a longer gap counts as this
 

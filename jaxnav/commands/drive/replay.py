@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive import replay_drive
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.datasets.odometry_delay import OdometryDelay, odometry_delay
-from jaxnav.datasets.recordings import Recording, read_recording
-from jaxnav.datasets.replay import Replay, errors, frames_in_view, motion_of, replay
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     apply_params,
@@ -27,8 +25,10 @@ from jaxnav.files import (
     write_json,
     write_tum,
 )
-from jaxnav.navigator import Navigator
-from jaxnav.plots.localisation import localisation_report
+from jaxnav.pictures.localisation import localisation_report
+from jaxnav.recordings.other.odometry_delay import OdometryDelay, odometry_delay
+from jaxnav.recordings.other.recordings import Recording, read_recording
+from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
 
 DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history

@@ -18,9 +18,8 @@ from jaxnav.commands.kinds import flag_of
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
-from jaxnav.configuration import step_folder
-from jaxnav.datasets.ros_drives import read_ros_drive
-from jaxnav.datasets.smoothed_drive import distances
+from jaxnav.drive.flags import Fault, Health, Reject, names
+from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     Params,
@@ -31,25 +30,26 @@ from jaxnav.files import (
     write_json,
     write_tum,
 )
-from jaxnav.loop.flags import Fault, Health, Reject, names
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.plots.localisation import localisation_report
-from jaxnav.recording.drive_events import DriveEvents, refused_odometry
-from jaxnav.recording.drive_format import PROFILE
-from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.drive_replay import (
+from jaxnav.files.configuration import step_folder
+from jaxnav.pictures.localisation import localisation_report
+from jaxnav.recordings.drive_events import DriveEvents, refused_odometry
+from jaxnav.recordings.drive_format import PROFILE
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.drive_replay import (
     Comparison,
     check_inputs,
     inputs_from_images,
     replay_drive,
 )
-from jaxnav.recording.drive_setup import DriveSetup, needs_float64
-from jaxnav.recording.mcap_messages import profile_of
-from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.messages import digest, input_message
-from jaxnav.recording.outcomes import Outcomes, outcome_message
-from jaxnav.recording.plausible import keep_plausible
-from jaxnav.recording.recorder import Recorder
+from jaxnav.recordings.drive_setup import DriveSetup, needs_float64
+from jaxnav.recordings.mcap_messages import profile_of
+from jaxnav.recordings.message_schemas import OUTCOME
+from jaxnav.recordings.messages import digest, input_message
+from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.other.smoothed_drive import distances
+from jaxnav.recordings.outcomes import Outcomes, outcome_message
+from jaxnav.recordings.plausible import keep_plausible
+from jaxnav.recordings.recorder import Recorder
 
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")

@@ -7,11 +7,11 @@ import numpy as np
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.pictures import corners_in_world, save_figure
-from jaxnav.datasets.smoothed_drive import DriveTrack, smooth_drive
 from jaxnav.files import write_tum
-from jaxnav.plots.localisation import localisation_report
-from jaxnav.recording.drive_events import DriveEvents
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.pictures.localisation import localisation_report
+from jaxnav.recordings.drive_events import DriveEvents
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.other.smoothed_drive import DriveTrack, smooth_drive
 
 
 def run(args: Arguments, events: DriveEvents, setup: DriveSetup) -> dict[str, Any]:

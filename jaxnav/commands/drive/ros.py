@@ -17,12 +17,12 @@ from jaxnav.commands.drive.ros_body import PreparedBody
 from jaxnav.commands.drive.ros_drive import OVER, PreparedDrive
 from jaxnav.commands.drive.ros_setup import Activity
 from jaxnav.commands.process import configure_jax
-from jaxnav.compiling.executables import keep_in
-from jaxnav.configuration import step_folder
+from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput, visible
+from jaxnav.files.configuration import step_folder
+from jaxnav.files.executables import keep_in
 from jaxnav.files.ros import load_ros
-from jaxnav.loop.signals import Signals
-from jaxnav.ros.connection import Connection
+from jaxnav.vehicles.ros.connection import Connection
 
 _LOOK_S = 0.05
 _CLOCK_S = 10.0  # for the first message of /clock

@@ -6,8 +6,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.drive.arguments import Ros
 from jaxnav.commands.drive.ros_setup import (
     Activity,
@@ -20,24 +18,26 @@ from jaxnav.commands.drive.ros_setup import (
     timed,
 )
 from jaxnav.commands.drive.run import searches_for
-from jaxnav.compiling.step import compiled_step
-from jaxnav.configuration import step_folder
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.odometry_errors import OdometryErrors
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.navigator import Navigator, Step
+from jaxnav.drive.compiled_step import compiled_step
+from jaxnav.drive.interfaces import Camera, Setup
+from jaxnav.drive.seeing import Search
+from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, load_markers, load_params
+from jaxnav.files.configuration import step_folder
 from jaxnav.files.ros import RosFile
-from jaxnav.loop.interfaces import Camera, Setup
-from jaxnav.loop.seeing import Search
-from jaxnav.loop.signals import Signals
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.odometry_errors import OdometryErrors
-from jaxnav.models.rig import CameraRig
-from jaxnav.navigator import Navigator, Step
-from jaxnav.ros.body import BodyTracker
-from jaxnav.ros.connection import Connection
-from jaxnav.ros.estimates import Report
-from jaxnav.ros.odom_frame import pose_of
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY
-from jaxnav.ros.odometry_track import GrowingTrack
+from jaxnav.recordings.ros.body import BodyTracker
+from jaxnav.recordings.ros.estimates import Report
+from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.recordings.ros.odometry_track import GrowingTrack
+from jaxnav.vehicles.ros.connection import Connection
+from jaxnav.vehicles.ros.odom_frame import pose_of
 from jaxnav.vehicles.ros2_cameras import open_cameras
 
 _LOOK_S = 0.05

@@ -24,25 +24,26 @@ from jaxnav.commands.drive.ros_setup import (
     timed,
 )
 from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, searches_for
-from jaxnav.configuration import step_folder
-from jaxnav.datasets.ros_drives import read_ros_drive
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Frame, Setup
+from jaxnav.drive.loop import Fenced
+from jaxnav.drive.pilot import Input, Outcome, Pilot
+from jaxnav.drive.seeing import Search
+from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput, Containment
 from jaxnav.files import Route, load_markers, load_params, load_route, load_vehicle
+from jaxnav.files.configuration import step_folder
 from jaxnav.files.ros import RosFile
 from jaxnav.files.vehicles import may_resume
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Frame, Setup
-from jaxnav.loop.loop import Fenced
-from jaxnav.loop.pilot import Input, Outcome, Pilot
-from jaxnav.loop.seeing import Search
-from jaxnav.loop.signals import Signals
-from jaxnav.recording.drive_replay import check_inputs
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.ros.connection import Connection, message_type
-from jaxnav.ros.estimates import pose_of_drive, report_of_drive
-from jaxnav.ros.odom_frame import OdomFrame
-from jaxnav.ros.publisher import Publisher
+from jaxnav.recordings.drive_replay import check_inputs
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.ros import message_type
+from jaxnav.recordings.ros.estimates import pose_of_drive, report_of_drive
+from jaxnav.vehicles.ros.connection import Connection
+from jaxnav.vehicles.ros.odom_frame import OdomFrame
+from jaxnav.vehicles.ros.publisher import Publisher
 
 OVER = "the bag is over"
 _CLOCK = "rosgraph_msgs/msg/Clock"

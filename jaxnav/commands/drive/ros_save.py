@@ -6,28 +6,28 @@ from importlib.metadata import version
 import jax
 import numpy as np
 
-from jaxnav.belief.camera_errors import EACH
-from jaxnav.belief.sensor_errors import LEARNT, SENSORS_END
 from jaxnav.commands.drive.ros_setup import path_of
+from jaxnav.core.filter.camera_errors import EACH
+from jaxnav.core.filter.sensor_errors import LEARNT, SENSORS_END
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Frame
+from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig, load_vehicle
 from jaxnav.files.provenance import calibrated_now
 from jaxnav.files.ros import RosFile
 from jaxnav.files.vehicles import as_car
 from jaxnav.files.writing import atomic_write_all
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.pilot import Input, Outcome
-from jaxnav.recording.adoption import (
+from jaxnav.recordings.adoption import (
     NEVER_SURE,
     NOTHING_KEPT,
     adopted_files,
     is_other_rig,
     is_other_vehicle,
 )
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.learnt import Learnt, errors_of
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.learnt import Learnt, errors_of
 
 _WHERE = "save"  # of what is wrong with none of the files
 

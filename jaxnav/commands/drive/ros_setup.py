@@ -5,21 +5,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig
 from jaxnav.files.ros import RosFile
 from jaxnav.files.validation import at
-from jaxnav.loop.signals import Signals
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.recording.drive_setup import PILOT_SELECTORS
-from jaxnav.ros.connection import Connection
-from jaxnav.ros.lenses import await_lenses, with_lenses
-from jaxnav.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf
-from jaxnav.ros.odometry_messages import NAV_ODOMETRY, TWIST_TYPES
-from jaxnav.ros.publisher import FrameNames, Publisher
+from jaxnav.recordings.drive_setup import PILOT_SELECTORS
+from jaxnav.recordings.ros.lenses import with_lenses
+from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY, TWIST_TYPES
+from jaxnav.vehicles.ros.connection import Connection, await_lenses
+from jaxnav.vehicles.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf
+from jaxnav.vehicles.ros.publisher import FrameNames, Publisher
 
 Say = Callable[[str], None]
 _TF = "tf2_msgs/msg/TFMessage"

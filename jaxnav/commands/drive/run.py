@@ -23,26 +23,26 @@ from jaxnav.commands.drive.learnt_watch import ExposureWatch
 from jaxnav.commands.drive.observers import closing_notes, open_onlookers
 from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
-from jaxnav.compiling.executables import keep_in
-from jaxnav.configuration import step_folder
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import Tracker, make_detectors
+from jaxnav.drive import plugins
+from jaxnav.drive.corrections import Corrections
+from jaxnav.drive.guard import Guard
+from jaxnav.drive.interfaces import AnyVehicle, HasOwnFiles, HasTime, Setup, SharesProcess
+from jaxnav.drive.limits import CommandLimits
+from jaxnav.drive.loop import Loop, Observer
+from jaxnav.drive.moved_vehicle import GuardProcess, MovedVehicle
+from jaxnav.drive.pilot import Pilot
+from jaxnav.drive.priority import before_others
+from jaxnav.drive.seeing import Eyes, Search
+from jaxnav.drive.signals import EXIT_STOPPED, Signals
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
+from jaxnav.files.configuration import step_folder
+from jaxnav.files.executables import keep_in
 from jaxnav.files.vehicles import may_resume
-from jaxnav.loop import plugins
-from jaxnav.loop.corrections import Corrections
-from jaxnav.loop.guard import Guard
-from jaxnav.loop.interfaces import AnyVehicle, HasOwnFiles, HasTime, Setup, SharesProcess
-from jaxnav.loop.limits import CommandLimits
-from jaxnav.loop.loop import Loop, Observer
-from jaxnav.loop.moved_vehicle import GuardProcess, MovedVehicle
-from jaxnav.loop.pilot import Pilot
-from jaxnav.loop.priority import before_others
-from jaxnav.loop.seeing import Eyes, Search
-from jaxnav.loop.signals import EXIT_STOPPED, Signals
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recordings.drive_setup import DriveSetup
 
 # How far the clock of a simulated vehicle runs ahead of a thread that does not come back: longer
 # than a camera's thread waits (0.05 s), shorter than the odometer takes to be stale (0.1 s).

@@ -9,14 +9,14 @@ from typing import Any
 
 from jaxnav.commands.drive.arguments import Stop
 from jaxnav.commands.kinds import key_values
+from jaxnav.drive import plugins
+from jaxnav.drive.guard import HEARD_WITHIN_S, Guard
+from jaxnav.drive.guard_process import CanNotMoveError, opened
+from jaxnav.drive.interfaces import SharesProcess
+from jaxnav.drive.limits import limits_of
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir
 from jaxnav.files.reading import read_mapping
-from jaxnav.loop import plugins
-from jaxnav.loop.guard import HEARD_WITHIN_S, Guard
-from jaxnav.loop.guard_process import CanNotMoveError, opened
-from jaxnav.loop.interfaces import SharesProcess
-from jaxnav.loop.limits import limits_of
 
 _NOT_HEARD = 1
 _OPENS_WITHIN_S = 30.0  # as the doctor waits for a driver

@@ -7,10 +7,10 @@ from jaxnav.commands.drive.arguments import ViewDrive as Arguments
 from jaxnav.commands.drive.plot import read_outcomes
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path, output_folder
-from jaxnav.plots.scenery import Scenery
-from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.plausible import keep_plausible, left_out_note
-from jaxnav.viewer.rerun_view import RerunView, import_rerun
+from jaxnav.pictures.rerun.view import RerunView, import_rerun
+from jaxnav.pictures.scenery import Scenery
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.plausible import keep_plausible, left_out_note
 
 
 def run(args: Arguments) -> int:

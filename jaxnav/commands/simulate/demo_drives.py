@@ -11,12 +11,12 @@ from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
 from jaxnav.commands.simulate.runner_up import SELECTOR, opencv_detectors
-from jaxnav.compiling.step import compiled_step
-from jaxnav.configuration import step_folder
+from jaxnav.core.models.geometry import wrap_angle_np
+from jaxnav.core.models.origin import planar_in_world
 from jaxnav.detection import Detector, Tracker, make_detectors
-from jaxnav.models.geometry import wrap_angle_np
-from jaxnav.models.origin import planar_in_world
-from jaxnav.simulation.drive import DriveFrame, DriveSettings, Methods, drive
+from jaxnav.drive.compiled_step import compiled_step
+from jaxnav.files.configuration import step_folder
+from jaxnav.sim.drive import DriveFrame, DriveSettings, Methods, drive
 
 OURS, OPENCV = "our_method", "opencv_first_pose"
 LABELS = {OURS: "our method", OPENCV: "OpenCV, first pose"}

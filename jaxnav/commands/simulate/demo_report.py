@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
 from jaxnav.commands.simulate.demo_drives import LABELS, OURS, Drives, Record
 from jaxnav.commands.simulate.demo_scores import RATES, lines
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.origin import Origin, planar_in_world, points_in_world, poses_in_world
 from jaxnav.files import write_json, write_tum
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.origin import Origin, planar_in_world, points_in_world, poses_in_world
-from jaxnav.plots.against_truth import Driven, report_against_truth
-from jaxnav.plots.localisation import AnnotatedFrame, camera_mosaic
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.simulation.drive import DriveFrame
-from jaxnav.simulation.scores import WRONG_DEG
+from jaxnav.pictures.against_truth import Driven, report_against_truth
+from jaxnav.pictures.localisation import AnnotatedFrame, camera_mosaic
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.sim.drive import DriveFrame
+from jaxnav.sim.scores import WRONG_DEG
 
 MOSAIC_ROWS = 3
 

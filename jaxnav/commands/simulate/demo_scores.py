@@ -9,8 +9,8 @@ import numpy as np
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.demo_drives import LABELS, OPENCV, OURS, Drives, Record
 from jaxnav.commands.simulate.rendered_world import RenderedWorld, expected_corners
-from jaxnav.simulation.drive import waypoints_passed
-from jaxnav.simulation.scores import WRONG_DEG
+from jaxnav.sim.drive import waypoints_passed
+from jaxnav.sim.scores import WRONG_DEG
 
 RATES = "how often it goes which way, over 20 seeds: docs/guide/demo.md"
 LOST_M = 1.0  # farther off than this, a car is lost: the paper's waypoints are 1.03 m apart

@@ -9,6 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxnav.commands.simulate.arguments import Demo
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.navigator import Navigator, Output
 from jaxnav.detection import Detections, Detector, Tracker, observe
 from jaxnav.detection.observe import marker_keys
 from jaxnav.errors import BadInput
@@ -21,17 +27,11 @@ from jaxnav.files import (
     load_rig,
     load_route,
 )
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.camera import Camera
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.navigator import Navigator, Output
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.simulation.drive import DriveSettings, PoseAt
-from jaxnav.simulation.rendering import Renderer
-from jaxnav.simulation.scene import Scene
-from jaxnav.simulation.sensor import Sensor, Shutter
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.sim.drive import DriveSettings, PoseAt
+from jaxnav.sim.rendering import Renderer
+from jaxnav.sim.scene import Scene
+from jaxnav.sim.sensor import Sensor, Shutter
 
 READOUT_S = 12e-3  # from the first row to the last, usual for a small CSI sensor
 # A small lens and a cheap sensor indoors: blurred by 0.7 px, 2 grey levels in the dark.

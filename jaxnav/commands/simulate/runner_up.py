@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.detection import Detections
 from jaxnav.detection.families import dictionary
 from jaxnav.detection.types import grey
-from jaxnav.models.camera import Camera
-from jaxnav.models.markers import MarkerMap
 
 SELECTOR = "lowest-reprojection"
 # RMS along one axis in the demo's images, against the rendered truth: see docs/guide/demo.md.

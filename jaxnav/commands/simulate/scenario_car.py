@@ -5,9 +5,15 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxnav.belief.ambiguity import Selector
-from jaxnav.belief.bicycle_kalman import BicycleKalman
 from jaxnav.commands.kinds import ScenarioCarFiles
+from jaxnav.core.filter.ambiguity import Selector
+from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
 from jaxnav.files import (
     Params,
@@ -19,15 +25,9 @@ from jaxnav.files import (
     load_route,
     load_vehicle,
 )
-from jaxnav.models.bicycle import Vehicle
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.navigator import Navigator
-from jaxnav.simulation.bases import equipped
-from jaxnav.simulation.corners import see
-from jaxnav.simulation.scenarios import Scenario, on_route, scenarios
+from jaxnav.sim.bases import equipped
+from jaxnav.sim.corners import see
+from jaxnav.sim.scenarios import Scenario, on_route, scenarios
 
 
 @dataclass(frozen=True)

@@ -10,22 +10,22 @@ import jax
 import jax.numpy as jnp
 from pydantic import Field
 
-from jaxnav.belief.selectors import SELECTORS, make_selector
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.core.filter.selectors import SELECTORS, make_selector
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
 from jaxnav.files import limits, load_params, write_json
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.files.writing import plain_data
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.navigator import Navigator
-from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scenarios import Scenario, on_laps
-from jaxnav.simulation.scores import Drives
+from jaxnav.sim.rollout import Rollout
+from jaxnav.sim.scenarios import Scenario, on_laps
+from jaxnav.sim.scores import Drives
 
 _FILES = "rig", "markers", "vehicle", "route", "params"
 # What a result of a version without these keys was made with.

@@ -12,7 +12,7 @@ from jaxnav.commands.study.arguments import Plot as Arguments
 from jaxnav.commands.study.studies import summary_of
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
-from jaxnav.plots.study import numeric_axes, study_curves, study_map, study_reliability
+from jaxnav.pictures.study import numeric_axes, study_curves, study_map, study_reliability
 
 MAPS = {
     "ambiguity": ("flip_rate", "success_rate", "rotation_error_deg_median"),

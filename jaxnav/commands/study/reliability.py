@@ -4,18 +4,18 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.study.arguments import StudyReliability as Arguments
-from jaxnav.datasets.recordings import read_recording
-from jaxnav.datasets.replay import replay
+from jaxnav.core.filter.selectors import make_selector
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
-from jaxnav.plots.localisation import reliability_diagram
-from jaxnav.simulation.random_views import random_views
-from jaxnav.simulation.statistics import Reliability
+from jaxnav.pictures.localisation import reliability_diagram
+from jaxnav.recordings.other.recordings import read_recording
+from jaxnav.recordings.other.replay import replay
+from jaxnav.sim.random_views import random_views
+from jaxnav.sim.statistics import Reliability
 
 
 def run(args: Arguments) -> int:

@@ -9,18 +9,18 @@ import jax
 import xarray as xr
 
 from jaxnav.errors import BadInput
+from jaxnav.experiments.studies.ambiguity import AmbiguityStudy
+from jaxnav.experiments.studies.config import Config
+from jaxnav.experiments.studies.damage import check_layout, check_trials, reading
+from jaxnav.experiments.studies.drives import DriveStudy
+from jaxnav.experiments.studies.store import count_done, read_attributes, read_dataset, read_layout
+from jaxnav.experiments.studies.study import Grid, Study
+from jaxnav.experiments.studies.summary import summarise
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.files.reading import read_mapping
-from jaxnav.studies.ambiguity import AmbiguityStudy
-from jaxnav.studies.config import Config
-from jaxnav.studies.damage import check_layout, check_trials, reading
-from jaxnav.studies.drives import DriveStudy
-from jaxnav.studies.store import count_done, read_attributes, read_dataset, read_layout
-from jaxnav.studies.study import Grid, Study
-from jaxnav.studies.summary import summarise
 
 KINDS: dict[str, type[Study]] = {"ambiguity": AmbiguityStudy, "drive": DriveStudy}
-SHIPPED = Path(__file__).resolve().parents[2] / "studies" / "configs"
+SHIPPED = Path(__file__).resolve().parents[2] / "experiments" / "studies" / "configs"
 
 
 def shipped_configs(kind: str) -> dict[str, Path]:

@@ -12,10 +12,15 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.commands.study.arguments import RunStudy as Arguments
 from jaxnav.commands.study.studies import KINDS, load_study, shipped_configs
 from jaxnav.errors import EXIT_INTERRUPTED, visible
+from jaxnav.experiments.studies.running import (
+    local_cluster,
+    remote_cluster,
+    run_here,
+    run_on_cluster,
+)
+from jaxnav.experiments.studies.store import count_done, open_store, sweep_unfinished
 from jaxnav.files import output_folder
 from jaxnav.files.locking import sole_writer
-from jaxnav.studies.running import local_cluster, remote_cluster, run_here, run_on_cluster
-from jaxnav.studies.store import count_done, open_store, sweep_unfinished
 
 
 def run(args: Arguments) -> int:

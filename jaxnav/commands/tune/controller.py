@@ -9,28 +9,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneController as Arguments
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.parameters import parameters_of
 from jaxnav.errors import BadInput
+from jaxnav.experiments.tuning.descent import Noisy
+from jaxnav.experiments.tuning.drive_loss import DriveLoss
+from jaxnav.experiments.tuning.driving import ClosedLoop
+from jaxnav.experiments.tuning.fit import Problem, TuningFit
+from jaxnav.experiments.tuning.objective import Batch, NotFinite
+from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import Params, load_params, output_folder
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.navigator import Navigator
-from jaxnav.parameters import parameters_of
-from jaxnav.plots.tuning import ControllerScores, controller_report
-from jaxnav.simulation.rollout import Rollout
-from jaxnav.simulation.scores import Drives
-from jaxnav.simulation.statistics import bootstrap_mean, wilson_interval
-from jaxnav.simulation.world import Spread
-from jaxnav.tuning.descent import Noisy
-from jaxnav.tuning.drive_loss import DriveLoss
-from jaxnav.tuning.driving import ClosedLoop
-from jaxnav.tuning.fit import Problem, TuningFit
-from jaxnav.tuning.objective import Batch, NotFinite
-from jaxnav.tuning.unconstrained import Space
+from jaxnav.pictures.tuning import ControllerScores, controller_report
+from jaxnav.sim.rollout import Rollout
+from jaxnav.sim.scores import Drives
+from jaxnav.sim.statistics import bootstrap_mean, wilson_interval
+from jaxnav.sim.world import Spread
 
 _CAR = (
     "controller.proportional_per_m",

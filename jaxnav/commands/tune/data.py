@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.belief.hypotheses import MultiHypothesis
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
@@ -21,13 +19,15 @@ from jaxnav.commands.tune.sequences import (
     navigator_of,
     sequences_of_recording,
 )
-from jaxnav.datasets.recordings import read_recording
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
+from jaxnav.experiments.tuning.recorded import FrameSequences, simulate_sequences
 from jaxnav.files import load_markers, load_rig
-from jaxnav.navigator import Navigator
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.simulation.rollout import Rollout
-from jaxnav.tuning.recorded import FrameSequences, simulate_sequences
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.other.recordings import read_recording
+from jaxnav.sim.rollout import Rollout
 
 AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
 _TEST_SEED = 10**6

@@ -9,10 +9,10 @@ import numpy as np
 
 from jaxnav.commands.tune.sequences import IDENTITY, bounds, cut, maps, side_by_side
 from jaxnav.errors import BadInput
-from jaxnav.recording.drive_events import DriveEvents, refused_odometry
-from jaxnav.recording.drive_log import DriveLog
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.tuning.recorded import FrameSequences
+from jaxnav.experiments.tuning.recorded import FrameSequences
+from jaxnav.recordings.drive_events import DriveEvents, refused_odometry
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.drive_setup import DriveSetup
 
 
 def sequences_of_drive(

@@ -7,26 +7,26 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxnav.belief.bicycle_kalman import BicycleKalman
-from jaxnav.belief.hypotheses import MultiHypothesis
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
+from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.parameters import TUNABLES, parameters_of, with_parameters
 from jaxnav.errors import BadInput
+from jaxnav.experiments.tuning.branches import estimate_sequences
+from jaxnav.experiments.tuning.descent import Smooth
+from jaxnav.experiments.tuning.filter import FilterCost
+from jaxnav.experiments.tuning.fit import Problem, TuningFit
+from jaxnav.experiments.tuning.objective import Batch, Objective, where_not_finite
+from jaxnav.experiments.tuning.recorded import FrameSequences
+from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import Params, apply_params, load_params, output_folder
-from jaxnav.navigator import Navigator
-from jaxnav.parameters import TUNABLES, parameters_of, with_parameters
-from jaxnav.plots.tuning import EstimatorScores, tuning_report
-from jaxnav.simulation.statistics import anees_band, bootstrap_mean
-from jaxnav.tuning.branches import estimate_sequences
-from jaxnav.tuning.descent import Smooth
-from jaxnav.tuning.filter import FilterCost
-from jaxnav.tuning.fit import Problem, TuningFit
-from jaxnav.tuning.objective import Batch, Objective, where_not_finite
-from jaxnav.tuning.recorded import FrameSequences
-from jaxnav.tuning.unconstrained import Space
+from jaxnav.pictures.tuning import EstimatorScores, tuning_report
+from jaxnav.sim.statistics import anees_band, bootstrap_mean
 
 _STAGES = 4
 

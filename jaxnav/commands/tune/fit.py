@@ -20,12 +20,12 @@ from matplotlib.figure import Figure
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.pictures import save_figure
 from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
+from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
+from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import write_json, write_params
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.npz import read_npz
 from jaxnav.files.writing import atomic_write, plain_data
-from jaxnav.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
-from jaxnav.tuning.unconstrained import Space
 
 Scores = TypeVar("Scores")
 

@@ -10,16 +10,16 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.belief.constant_velocity import ConstantVelocity
-from jaxnav.belief.selectors import make_selector
-from jaxnav.datasets.recording import Recording
-from jaxnav.datasets.replay import estimate_corner_sigma_px
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.origin import opposite, poses_in_world
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.pose.observation import Observation
 from jaxnav.errors import BadInput
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.origin import opposite, poses_in_world
-from jaxnav.navigator import Navigator
-from jaxnav.pose.observation import Observation
-from jaxnav.tuning.recorded import FrameSequences
+from jaxnav.experiments.tuning.recorded import FrameSequences
+from jaxnav.recordings.other.recording import Recording
+from jaxnav.recordings.other.replay import estimate_corner_sigma_px
 
 LEAST_SEQUENCES = 4
 GAP_S = 0.5  # a marker that was away for longer appears anew

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.belief.sensor_errors import LEARNT, SENSORS_END, SIX, SLIP
 from jaxnav.cli import main
+from jaxnav.core.filter.sensor_errors import LEARNT, SENSORS_END, SIX, SLIP
+from jaxnav.core.models.bicycle import SENSORS_AS_TOLD
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
-from jaxnav.models.bicycle import SENSORS_AS_TOLD
-from jaxnav.recording.message_schemas import OUTCOME
-from jaxnav.recording.outcomes import outcome_message
-from jaxnav.recording.recorder import Recorder
+from jaxnav.recordings.message_schemas import OUTCOME
+from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.recorder import Recorder
 from tests.helpers.drives import make_outcome
 from tests.helpers.simulated import make_setup
-from tests.recording.test_learnt import SIGMA, told_rig, turned
+from tests.recordings.test_learnt import SIGMA, told_rig, turned
 
 TURN_RAD = np.deg2rad([0.3, -0.2, 1.2])  # of the second camera, about the vehicle's axes
 SENSORS, SENSORS_SIGMA = np.array([0.02, -0.01, 0.004, 0.012]), np.array([2, 10, 1, 3]) * 1e-3

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from jaxnav import cli
-from jaxnav.calibration.boards.board import Board
-from jaxnav.calibration.lenses import comparison as lens_comparison
-from jaxnav.calibration.lenses.images import calibrate_images
+from jaxnav.calibrate.board.board import Board
+from jaxnav.calibrate.lens import comparison as lens_comparison
+from jaxnav.calibrate.lens.images import calibrate_images
 from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import write_board
+from jaxnav.core.models.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
 from jaxnav.files.reading import read_mapping
-from jaxnav.models.camera import Camera
 from tests.helpers.board_pictures import board_pictures
 
 VIEWS = 7  # as few as leave the comparison of lenses out, which compiles long

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxnav.calibration.odometry.drive import Drive
-from jaxnav.calibration.odometry.model import NAMES
+from jaxnav.calibrate.odometry.drive import Drive
+from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.cli import main
 from jaxnav.commands.calibrate.odometry_recordings import drive_of
 from jaxnav.detection import Detections
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Odometry
+from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import load_vehicle, save_markers
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
-from jaxnav.loop.pilot import Input
-from jaxnav.recording.messages import input_message
-from jaxnav.recording.recorder import Recorder
+from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.recorder import Recorder
 from tests import worlds
 from tests.helpers.odometry_drives import RECIPE, START, TRUTH, sensed, true_track
 from tests.helpers.simulated import make_setup

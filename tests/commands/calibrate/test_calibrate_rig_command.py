@@ -10,20 +10,20 @@ import rig_rooms
 import yaml
 
 from jaxnav import cli
-from jaxnav.calibration.rigs.pose_arrays import Ts_vehicle_camera, turn_rad
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, turn_rad
 from jaxnav.commands.calibrate import check as calibrate_check
 from jaxnav.commands.calibrate import markers as calibrate_markers
 from jaxnav.commands.calibrate import rig as calibrate_rig
 from jaxnav.commands.calibrate.report import coverage
-from jaxnav.datasets.sightings import read_sightings
 from jaxnav.detection.types import Detections
+from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.interfaces import Odometry
+from jaxnav.drive.pilot import Input
 from jaxnav.files import load_markers, load_rig, save_markers, save_rig
-from jaxnav.loop.frames import FrameDetections
-from jaxnav.loop.interfaces import Odometry
-from jaxnav.loop.pilot import Input
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.recording.messages import input_message
-from jaxnav.recording.recorder import Recorder
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.other.sightings import read_sightings
+from jaxnav.recordings.recorder import Recorder
 from tests.helpers.setups import setup_with
 from tests.helpers.simulated import ROUTE
 

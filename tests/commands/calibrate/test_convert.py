@@ -12,13 +12,13 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.figures import CameraFigures, MarkerFigures
 from jaxnav.files.markers import markers_text
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import rig_text
-from jaxnav.models.camera import LENS_COEFFICIENTS
 from tests.helpers import seed_texts
 from tests.helpers.conversions import (
     HELD,

@@ -9,10 +9,10 @@ import yaml
 
 from jaxnav import cli, files
 from jaxnav.commands.calibrate.arguments import CalibrateConvert
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures
 from jaxnav.files.rigs import rig_text
-from jaxnav.models.camera import LENS_COEFFICIENTS
 from tests.helpers.conversions import (
     KALIBR,
     PHOTONVISION,

@@ -144,8 +144,8 @@ def test_whether_the_step_is_compiled_is_looked_up(monkeypatch, tmp_path, capsys
         asked.append("advance_packed" in structures)
         return "the.step"
 
-    monkeypatch.setattr("jaxnav.configuration.step_folder", lambda: tmp_path)
-    monkeypatch.setattr("jaxnav.compiling.executables._file", file)
+    monkeypatch.setattr("jaxnav.files.configuration.step_folder", lambda: tmp_path)
+    monkeypatch.setattr("jaxnav.files.executables._file", file)
     monkeypatch.setattr(f"{CHECKS}.software.compile_cache", lambda directory, compiled, refused: [
         Finding("compile cache", "ok", f"compiled: {compiled}")
     ])  # fmt: skip

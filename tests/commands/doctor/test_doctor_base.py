@@ -4,10 +4,10 @@ import pytest
 
 from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry
 from jaxnav.commands.doctor.route_file import route_file, turning_radius_m, vehicle_file
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.drive.chassis import chassis_of
+from jaxnav.drive.interfaces import Odometry, TwistOdometry
 from jaxnav.files import calib_dir, load_route
-from jaxnav.loop.chassis import chassis_of
-from jaxnav.loop.interfaces import Odometry, TwistOdometry
-from jaxnav.models.twist_base import TwistBase
 from tests.helpers.findings import all_well, the_problem
 from tests.worlds import paper_markers
 

@@ -8,13 +8,13 @@ import pytest
 
 from jaxnav.commands.doctor.fits import Sighted
 from jaxnav.commands.doctor.photographs import examine_pictures, in_their_order
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import CornerLanes
 from jaxnav.files import Route
-from jaxnav.models.markers import MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.simulation.rendering import Renderer
-from jaxnav.simulation.scene import Scene
-from jaxnav.simulation.sensor import Sensor
+from jaxnav.sim.rendering import Renderer
+from jaxnav.sim.scene import Scene
+from jaxnav.sim.sensor import Sensor
 from tests.helpers.findings import all_well, the_problem
 from tests.worlds import marker_map, observe, planar, qcar_rig, upright
 

@@ -14,9 +14,9 @@ from jaxnav.commands.doctor.camera_frames import Watched, judge_cameras, skew
 from jaxnav.commands.doctor.findings import EXIT_UNREADABLE, Report
 from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry, plug_ins
 from jaxnav.detection.types import Detections
+from jaxnav.drive.chassis import chassis_of
+from jaxnav.drive.interfaces import Frame, Odometry
 from jaxnav.errors import BadInput
-from jaxnav.loop.chassis import chassis_of
-from jaxnav.loop.interfaces import Frame, Odometry
 from tests.helpers.findings import all_well, the_problem
 from tests.helpers.setups import GoodCamera, GoodVehicle, setup_with
 

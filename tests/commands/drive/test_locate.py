@@ -13,8 +13,8 @@ from PIL import Image
 from jaxnav.cli import main
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.files import calib_dir, load_markers, load_rig
-from jaxnav.simulation.rendering import Renderer
-from jaxnav.simulation.scene import Scene
+from jaxnav.sim.rendering import Renderer
+from jaxnav.sim.scene import Scene
 
 QCAR = calib_dir() / "qcar"
 POSE = np.array([np.cos(1.0), 0, 0, np.sin(1.0), 0.9, -0.3, 0.0])  # heading 115 degrees

@@ -19,12 +19,12 @@ from jaxnav.commands.drive.observers import (
     open_onlookers,
 )
 from jaxnav.detection.types import Detections
+from jaxnav.drive.flags import Fault
+from jaxnav.drive.interfaces import Frame
+from jaxnav.drive.pilot import FrameDetections
 from jaxnav.errors import BadInput
-from jaxnav.loop.flags import Fault
-from jaxnav.loop.interfaces import Frame
-from jaxnav.loop.pilot import FrameDetections
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
 from tests.helpers.drives import make_input, make_outcome, make_picture
 from tests.helpers.simulated import make_setup
 
@@ -89,7 +89,7 @@ def test_a_view_that_is_gone_is_no_fault_and_is_told_in_the_end():
 
 
 def test_what_the_arguments_ask_for_looks_on_and_is_closed(setup, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxnav.viewer.rerun_view.RerunView", FakeView)
+    monkeypatch.setattr("jaxnav.pictures.rerun.view.RerunView", FakeView)
     path = tmp_path / "drive.mcap"
     with ExitStack() as closing:
         found = open_onlookers(Run(record=path, view=True), setup, closing)

@@ -7,11 +7,11 @@ import pytest
 import yaml
 
 from jaxnav.commands.drive.ros_save import LearntKeeper
+from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
 from jaxnav.files.ros import load_ros
-from jaxnav.loop.pilot import Input
-from jaxnav.recording.drive_setup import DriveSetup
+from jaxnav.recordings.drive_setup import DriveSetup
 from tests.commands.calibrate.test_adopt import adopt, learnt_outcome, record, setup_of
 from tests.helpers import late
 

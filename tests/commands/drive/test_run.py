@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
+from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.drive.flags import Fault, Health
 from jaxnav.files import calib_dir, save_vehicle, write_params
-from jaxnav.loop.flags import Fault, Health
-from jaxnav.models.twist_base import TwistBase
-from jaxnav.recording.drive_log import read_drive
+from jaxnav.recordings.drive_log import read_drive
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnav.commands.drive.observers import WIDTH, notice, status_line
-from jaxnav.loop.flags import Fault, Health
+from jaxnav.drive.flags import Fault, Health
 from tests.helpers.drives import make_outcome
 
 FLOATS = st.floats() | st.floats(-500, 500) | st.sampled_from([-0.0, 1e308, -1e308, 5e-324])

@@ -11,8 +11,8 @@ from jaxnav.cli import main
 from jaxnav.commands.simulate.demo_scores import overall, overall_lines
 from jaxnav.commands.simulate.rendered_world import RenderedWorld
 from jaxnav.commands.simulate.runner_up import SIGMA_PX
+from jaxnav.core.navigator import Navigator
 from jaxnav.files import calib_dir, write_params
-from jaxnav.navigator import Navigator
 
 QCAR = calib_dir() / "qcar"
 TRAJECTORIES = (

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
-from jaxnav.belief.selectors import make_selector
 from jaxnav.commands.simulate.runner_up import SELECTOR, SIGMA_PX, OpenCVDetector
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.pose.observation import Observation
 from jaxnav.detection import marker_cells, observe
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
-from jaxnav.models.geometry import T_world_vehicle_from_planar
-from jaxnav.models.markers import CORNER_SIGNS, MarkerMap
-from jaxnav.models.rig import CameraRig
-from jaxnav.navigator import Navigator
-from jaxnav.pose.observation import Observation
 
 QCAR = calib_dir() / "qcar"
 

@@ -6,19 +6,19 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from jaxnav.belief.selectors import SELECTORS
 from jaxnav.cli import main
 from jaxnav.commands.kinds import Scenario, Selector, SimulatedSelector
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.simulate.simulate import _navigator
+from jaxnav.core.filter.selectors import SELECTORS
+from jaxnav.core.parameters import parameters_of
 from jaxnav.files import load_params, write_params
-from jaxnav.parameters import parameters_of
-from jaxnav.recording.drive_setup import PILOT_SELECTORS
-from jaxnav.simulation.rollout import Trace
-from jaxnav.simulation.scenarios import on_laps, scenarios
-from jaxnav.simulation.scores import Drives
-from jaxnav.simulation.statistics import Reliability
+from jaxnav.recordings.drive_setup import PILOT_SELECTORS
+from jaxnav.sim.rollout import Trace
+from jaxnav.sim.scenarios import on_laps, scenarios
+from jaxnav.sim.scores import Drives
+from jaxnav.sim.statistics import Reliability
 from tests.helpers.strangers import jaxnav
 
 SCENARIO = scenarios()["paper"]

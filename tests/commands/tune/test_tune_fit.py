@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from jaxnav.commands.tune.fit import Fitting
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.parameters import with_parameters
 from jaxnav.errors import BadInput
+from jaxnav.experiments.tuning.descent import Noisy, Smooth
+from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of
+from jaxnav.experiments.tuning.objective import Batch, Objective, where_not_finite
+from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import load_params
 from jaxnav.files.locking import sole_writer
-from jaxnav.navigator import Navigator
-from jaxnav.parameters import with_parameters
-from jaxnav.tuning.descent import Noisy, Smooth
-from jaxnav.tuning.fit import Problem, TuningFit, arrays_of
-from jaxnav.tuning.objective import Batch, Objective, where_not_finite
-from jaxnav.tuning.unconstrained import Space
 from tests import worlds
 
 NAVIGATOR = with_parameters(

@@ -18,15 +18,15 @@ from jaxnav.commands.tune.sequences import (
     navigator_of,
     sequences_of_recording,
 )
-from jaxnav.datasets.recording import Recording
-from jaxnav.datasets.recordings import read_recording
+from jaxnav.core.models.geometry import rotation_error_rad
 from jaxnav.errors import BadInput
-from jaxnav.models.geometry import rotation_error_rad
-from jaxnav.recording.drive_events import believed_events
-from jaxnav.recording.drive_log import read_drive
-from jaxnav.recording.drive_setup import DriveSetup
-from jaxnav.tuning.branches import estimate_sequences, find_starts
-from jaxnav.tuning.recorded import FrameSequences
+from jaxnav.experiments.tuning.branches import estimate_sequences, find_starts
+from jaxnav.experiments.tuning.recorded import FrameSequences
+from jaxnav.recordings.drive_events import believed_events
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
+from jaxnav.recordings.other.recording import Recording
+from jaxnav.recordings.other.recordings import read_recording
 
 HALVES = [(0, 0.5), (0.5, 1)]
 PLAIN = Path(__file__).parents[2] / "data" / "drives" / "plain.mcap"

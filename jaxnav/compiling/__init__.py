@@ -1,1 +1,0 @@
-"""Compile programs once on a machine, and keep their executables."""

@@ -1,0 +1,304 @@
+"""Steering and throttle towards the next waypoint.
+
+Source: Liu, Schofield, Shan (2023), Eqs. 16-19.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.core.models.bicycle import Vehicle, curvature_per_m, sideslip_rad
+from jaxnav.core.models.geometry import EVEN_RAD, safe_atan2, safe_norm, wrap_angle
+from jaxnav.core.models.twist_base import TwistBase
+
+Kind = TypeVar("Kind", bound="Follower")
+
+
+class Command(eqx.Module):
+    """Steering and throttle for the vehicle, inside its limits."""
+
+    steering_rad: Float[Array, ""]
+    throttle: Float[Array, ""]  # the driver's unit
+
+
+class ControlLog(eqx.Module):
+    """The quantities between the pose and the command, for records and plots."""
+
+    distance_m: Float[Array, ""]  # L_d
+    alpha_rad: Float[Array, ""]
+    sideslip_rad: Float[Array, ""]  # beta
+    integral_ms: Float[Array, ""]  # integral of L_d over time, m s
+
+
+class ControlState(eqx.Module):
+    """The state that the controller carries from one command to the next."""
+
+    waypoint_index: Int[Array, ""]  # W once the last one is reached
+    integral_ms: Float[Array, ""]
+    explored_s: Float[Array, ""]  # duration of the exploration since the pose was last decided
+    side: Float[Array, ""]  # of the line of sight, where it explores: 1 left, -1 right, 0 none
+
+    def exploring(self, given: "ControlInput", side: Float[Array, ""]) -> "ControlState":
+        """The state after exploring to a side for `dt_s`; a decided pose ends the exploration."""
+        return dataclasses.replace(
+            self,
+            explored_s=jnp.where(given.decided, 0, self.explored_s + given.elapsed_s()),
+            side=jnp.where(given.decided, 0, side),
+        )
+
+
+class Exploration(eqx.Module):
+    """Motion of a car while several poses are possible.
+
+    The car drives slowly at `angle_rad` to the line of sight, to the side it points to already:
+    motion across the line of sight separates the poses from their mirror images. Whichever pose is
+    the true one, the car gets nearer to the marker and stays inside the circle around it on which
+    it stood; the ground between the two is open, since the marker is seen. After `duration_s`, or
+    nearer than `min_range_m`, the car stands until the pose is decided.
+    """
+
+    speed_mps: float = 0.5
+    settle_s: float = 0.1  # time constant to that speed; the throttle leads the motor's lag
+    angle_rad: float = float(np.deg2rad(60.0))
+    reach_m: float = 0.4  # distance of the point on that course at which it steers
+    min_range_m: float = 0.7
+    duration_s: float = 12.0
+
+
+class ControlInput(eqx.Module):
+    """What a command follows from."""
+
+    pose: Float[Array, " 3"]  # (x_m, y_m, psi_rad) of the vehicle in the world
+    located: Bool[Array, ""]  # whether a pose has been estimated yet
+    steering_rad: Float[Array, ""]  # measured, for the sideslip; a NaN is taken as 0
+    dt_s: Float[Array, ""]  # since the previous command; 0 where it is not positive and finite
+    decided: Bool[Array, ""] | bool = True  # whether the pose may be acted upon
+    # Position of the nearest marker in vehicle axes, the same under all poses that are still
+    # possible. Needed where `decided` may be False.
+    to_marker_m: Float[Array, " 2"] | None = None
+    # Measured speed, which exploration controls; NaN: it drives open-loop.
+    speed_mps: Float[Array, ""] | float = np.nan
+
+    def elapsed_s(self) -> Float[Array, ""]:
+        """`dt_s` where it is a time, else 0."""
+        return jnp.where(jnp.isfinite(self.dt_s) & (self.dt_s > 0), self.dt_s, 0)
+
+
+class Way(NamedTuple):
+    """The way to the waypoint of a state."""
+
+    distance_m: Float[Array, ""]
+    alpha_rad: Float[Array, ""]  # from the course to the waypoint
+    done: Bool[Array, ""]  # the last waypoint is reached
+    drives: Bool[Array, ""]  # there is a waypoint, and a pose from which to drive there
+
+
+class Follower(eqx.Module):
+    """Base class of the controllers: waypoint after waypoint, whatever is commanded."""
+
+    waypoints_m: eqx.AbstractVar[Float[Array, "W 2"]]
+    waypoint_radius_m: eqx.AbstractVar[Float[Array, ""]]
+    vehicle: eqx.AbstractVar[Vehicle | TwistBase]
+
+    @classmethod
+    def along(
+        cls: type[Kind],
+        waypoints_m: Sequence[Sequence[float]] | Float[Array, "W 2"],
+        vehicle: Vehicle | TwistBase | None,
+        **numbers: float,
+    ) -> Kind:
+        """A controller of plain numbers, by the names of its fields.
+
+        Raises:
+            ValueError: no vehicle, or waypoints of the wrong shape.
+        """
+        waypoints = jnp.asarray(waypoints_m, float)
+        if vehicle is None:
+            raise ValueError("waypoints_m needs a vehicle to drive")
+        if waypoints.ndim != 2 or waypoints.shape[1] != 2:
+            raise ValueError(f"waypoints_m must be (W, 2), got {waypoints.shape}")
+        arrays: dict[str, Any] = {k: jnp.asarray(number, float) for k, number in numbers.items()}
+        return cls(waypoints_m=waypoints, vehicle=vehicle, **arrays)
+
+    def init(self) -> ControlState:
+        """The state at the first waypoint, with a zero integral."""
+        zero = jnp.zeros_like(self.waypoint_radius_m)
+        return ControlState(jnp.asarray(0), zero, zero, zero)
+
+    def __call__(
+        self,
+        state: ControlState,
+        pose: Float[Array, " 3"],
+        located: Bool[Array, ""],
+        steering_rad: Float[Array, ""],
+        dt_s: Float[Array, ""],
+        decided: Bool[Array, ""] | bool = True,
+        to_marker_m: Float[Array, " 2"] | None = None,
+        speed_mps: Float[Array, ""] | float = np.nan,
+    ) -> tuple[ControlState, Any, Bool[Array, ""], ControlLog]:
+        """One command, towards the next waypoint if the present one is reached.
+
+        Args:
+            state: after the previous command.
+            pose: this and all others as in `ControlInput`.
+
+        Returns:
+            The next state, the command, whether the last waypoint is reached, and the log.
+        """
+        count, index = self.waypoints_m.shape[0], state.waypoint_index
+        short_m = self.short_of(index, pose)
+        arrived = located & decided & (short_m <= 0)
+        index = jnp.minimum(index + (arrived & (index < count)), count)
+        integral_ms = jnp.where(arrived, 0, state.integral_ms)
+        state = ControlState(index, integral_ms, state.explored_s, state.side)
+        sensed = pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
+        return self.towards(state, ControlInput(*sensed))
+
+    @abc.abstractmethod
+    def towards(
+        self, state: ControlState, given: ControlInput
+    ) -> tuple[ControlState, Any, Bool[Array, ""], ControlLog]:
+        """One command towards the waypoint of the state, whether it is reached or not."""
+
+    def way(
+        self, state: ControlState, given: ControlInput, sideslip_rad: Float[Array, ""] | float = 0.0
+    ) -> Way:
+        """The way to the waypoint of the state, for a course turned from the heading."""
+        count, index = self.waypoints_m.shape[0], state.waypoint_index
+        done = index >= count
+        to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - given.pose[:2]
+        distance_m = safe_norm(to_waypoint)
+        bearing_rad = safe_atan2(to_waypoint[1], to_waypoint[0])
+        alpha_rad = wrap_angle(bearing_rad - given.pose[2] - sideslip_rad)
+        # A waypoint straight behind is on the left, not on the side of the last bit.
+        alpha_rad = jnp.where(alpha_rad < EVEN_RAD - jnp.pi, alpha_rad + 2 * jnp.pi, alpha_rad)
+        finite = jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
+        return Way(distance_m, alpha_rad, done, given.located & ~done & finite)
+
+    def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
+        """Distance to the circle inside which a waypoint counts as reached, m; negative inside."""
+        waypoint_m = self.waypoints_m[jnp.minimum(index, self.waypoints_m.shape[0] - 1)]
+        return safe_norm(waypoint_m - pose[:2]) - self.waypoint_radius_m
+
+
+class Controller(Follower):
+    """Ackermann steering on an arc to the waypoint, and PI throttle on the distance to it.
+
+        alpha = atan2(Y_d - y, X_d - x) - psi - beta                               (Eq. 17)
+        steering = atan(2 l sin(alpha) / (L_d cos(beta)))                          (Eq. 18)
+        throttle = p1 L_d + p2 integral of L_d dt                                  (Eq. 19)
+
+    with the waypoint (X_d, Y_d) and its distance L_d, m, the pose (x, y, psi), the sideslip beta of
+    the measured steering angle, and the wheelbase l.
+
+    The paper's sum of distances never decreases. Here it is an integral over time, limited to
+    `integral_limit_ms` and reset at every waypoint. The throttle is zero after the last waypoint,
+    before the first pose, and where the pose is not finite. A car would orbit a waypoint inside the
+    smallest circle it can drive: it drives straight on until it can reach the waypoint. While the
+    pose is undecided the car explores instead, and no waypoint counts as reached.
+
+    The paper lacks `lookahead_m` and `slows_at_rad`; at their default, infinity, they have no
+    effect.
+
+    Source: Liu, Schofield, Shan (2023), Eqs. 16-19; see docs/design.md, Steering and throttle.
+    """
+
+    waypoints_m: Float[Array, "W 2"]
+    waypoint_radius_m: Float[Array, ""]
+    vehicle: Vehicle
+    proportional_per_m: Float[Array, ""]  # p1, throttle per metre
+    integral_per_ms: Float[Array, ""]  # p2, throttle per metre second
+    integral_limit_ms: Float[Array, ""]
+    # Steers as towards a point at L_d / (1 + L_d / lookahead_m); inf: at the waypoint.
+    lookahead_m: Float[Array, ""] | float = np.inf
+    # The throttle is halved where |alpha| is this large; inf: never.
+    slows_at_rad: Float[Array, ""] | float = np.inf
+    exploration: Exploration = Exploration()
+
+    def towards(
+        self, state: ControlState, given: ControlInput
+    ) -> tuple[ControlState, Command, Bool[Array, ""], ControlLog]:
+        """One command towards the waypoint of the state, whether it is reached or not."""
+        steering_limit, decided = self.vehicle.steering_limit_rad, given.decided
+        steering_rad = jnp.where(jnp.isfinite(given.steering_rad), given.steering_rad, 0)
+        beta_rad = sideslip_rad(jnp.clip(steering_rad, -steering_limit, steering_limit))
+        distance_m, alpha_rad, done, drives = self.way(state, given, beta_rad)
+
+        ahead_m = distance_m / (1 + distance_m / self.lookahead_m)
+        steering = self._steering(alpha_rad, ahead_m, beta_rad)
+        steering = jnp.where(self._orbited(alpha_rad, distance_m), 0, steering)
+        grown_ms = jnp.where(drives & decided, distance_m * given.elapsed_s(), 0)
+        integral_ms = jnp.clip(state.integral_ms + grown_ms, 0, self.integral_limit_ms)
+        throttle = self.proportional_per_m * distance_m + self.integral_per_ms * integral_ms
+        # Clipped, or a heading of 1e270 rad would leave inf / inf.
+        off_course = jnp.clip(alpha_rad, -jnp.pi, jnp.pi) / self.slows_at_rad
+        throttle = throttle / (1 + off_course**2)
+        limit = self.vehicle.throttle_limit
+        state, explore = self._explore(state, given, beta_rad)
+        steering = jnp.where(decided, steering, explore.steering_rad)
+        throttle = jnp.where(decided, jnp.clip(throttle, -limit, limit), explore.throttle)
+        command = Command(
+            steering_rad=jnp.where(drives, steering, 0),
+            throttle=jnp.where(drives, throttle, 0),
+        )
+        log = ControlLog(distance_m, alpha_rad, beta_rad, integral_ms)
+        state = dataclasses.replace(state, integral_ms=integral_ms)
+        return state, command, done, log
+
+    def _explore(
+        self, state: ControlState, given: ControlInput, beta_rad: Float[Array, ""]
+    ) -> tuple[ControlState, Command]:
+        """The command while the pose is undecided; see `Exploration`."""
+        zero, to_marker_m = jnp.zeros_like(beta_rad), given.to_marker_m
+        if to_marker_m is None:
+            return state, Command(zero, zero)
+        explore, limit = self.exploration, self.vehicle.steering_limit_rad
+        range_m = safe_norm(to_marker_m)
+        bearing_rad = safe_atan2(to_marker_m[1], to_marker_m[0])
+        nearer_side = jnp.where(bearing_rad > EVEN_RAD, -1.0, 1.0).astype(beta_rad.dtype)
+        side = jnp.where(state.side == 0, nearer_side, state.side)
+        alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad - beta_rad)
+        steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)
+        goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
+        lead = jnp.maximum(self.vehicle.speed_time_constant_s / explore.settle_s - 1, 0)
+        short_mps = explore.speed_mps - given.speed_mps
+        short_mps = jnp.where(jnp.isfinite(short_mps), short_mps, 0)
+        throttle = (explore.speed_mps + lead * short_mps) / self.vehicle.speed_per_throttle_mps
+        throttle = jnp.clip(throttle, 0, self.vehicle.throttle_limit)
+        command = Command(steering, jnp.where(goes, throttle, 0))
+        return state.exploring(given, side), command
+
+    def _orbited(
+        self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""]
+    ) -> Bool[Array, ""]:
+        """Whether the waypoint lies so deep inside the smallest circle that the car would orbit it.
+
+        Driving straight on takes the waypoint out of the circle.
+        """
+        limit = self.vehicle.steering_limit_rad
+        radius_m = 1 / curvature_per_m(limit, self.vehicle.wheelbase_m)
+        # From the circle's centre, on the waypoint's side of the course.
+        ahead_m = distance_m * jnp.cos(alpha_rad)
+        aside_m = distance_m * jnp.abs(jnp.sin(alpha_rad)) - radius_m
+        missed_by_m = radius_m - safe_norm(jnp.stack([ahead_m, aside_m]))
+        return missed_by_m > self.waypoint_radius_m / 2
+
+    def _steering(
+        self, alpha_rad: Float[Array, ""], distance_m: Float[Array, ""], beta_rad: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """atan(2 l sin(alpha) / (L_d cos(beta))) (Eq. 18), within the limit.
+
+        A waypoint behind the axle gets full lock: the arc of Eq. 18 would straighten out there and
+        drive away from it.
+        """
+        reach_m = jnp.maximum(distance_m, 1e-3) * jnp.cos(beta_rad)
+        arc = jnp.arctan(2 * self.vehicle.wheelbase_m * jnp.sin(alpha_rad) / reach_m)
+        limit = self.vehicle.steering_limit_rad
+        lock = jnp.where(alpha_rad >= 0, limit, -limit)
+        return jnp.clip(jnp.where(jnp.abs(alpha_rad) > jnp.pi / 2, lock, arc), -limit, limit)

@@ -1,0 +1,329 @@
+"""A bank of hypotheses that postpones the choice between the poses of a marker.
+
+Range and bearing of a marker are measured well; the direction it is seen from is not, and its
+likelihood has two peaks or, under much noise, one flat valley. So the bank starts as a fan over
+the viewing direction. Each hypothesis then minimises the paper's e = e1 + e2 in its whitened form,
+
+    |r(T)|^2 / sigma^2 + |xi|^2_P,      T = T_prior exp(xi),
+
+straight on the corners, instead of comparing e at two poses. How well the minimum explains the
+corners, and how much of its prior it leaves, weighs the hypothesis; motion across the line of
+sight drives the true one and its mirror image apart.
+
+Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27 (Laplace's evidence);
+Alspach, Sorenson (1972) (Gaussian sums).
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.core.filter.ambiguity import PoseBelief, PosePosterior, Selection
+from jaxnav.core.filter.bank import EVEN_LOG_WEIGHT
+from jaxnav.core.filter.branches import SecondPoses, give_slots, second_poses
+from jaxnav.core.filter.fan import CANDIDATES, fan, normalise
+from jaxnav.core.filter.flips import beyond, nearer_to_another
+from jaxnav.core.filter.gate import excess_of
+from jaxnav.core.filter.map_fit import PoseFit, fit_poses
+from jaxnav.core.filter.merging import find_heirs
+from jaxnav.core.linalg.levenberg_marquardt import mark_found
+from jaxnav.core.linalg.small_matrices import first_highest
+from jaxnav.core.linalg.trees import where
+from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad, safe_norm, safe_sqrt
+from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.pose.observation import Snapshot
+
+# Corners off by more than so many of their sigmas, however the vehicle stands, start no branch.
+_TELLS_BRANCHES = 2.0
+
+
+class MultiHypothesis(eqx.Module):
+    """A selector that keeps K weighted hypotheses of the vehicle's pose and reports the heaviest.
+
+    Each hypothesis k minimises e(T) = |r(T)|^2 / sigma^2 + |xi|^2_P next to its prediction, and its
+    weight is multiplied with Laplace's evidence at the minimum:
+
+        log w_k += -e(T_k) / 2 - log |A + I| / 2,
+
+    where A is J'J of the corners in units of the prediction's sigma.
+
+    `flip_probability` is the mass farther than `far_rad` from the reported pose, or nearer to
+    another candidate than to the selected one, with the tails of every hypothesis. The bank is
+    `decided` when hypotheses farther off than `far_rad` weigh less than `decided_mass` and all of
+    them together know the orientation to `decided_sigma_rad`; until then the car explores (see
+    `control.Exploration` and docs/design.md, Ambiguity).
+
+    Where the prediction of a settled bank spans a second candidate as well, an empty slot takes
+    that posterior (see `branches.py`).
+
+    The bank can't decide while the vehicle stands and both poses fit the image equally well. It
+    takes the corner errors of different frames for independent: the corners' sigma has to include
+    what calibration leaves.
+
+    Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27.
+    """
+
+    hypotheses: int = eqx.field(static=True, default=24)  # >= 5
+    max_steps: int = eqx.field(static=True, default=60)  # few frames need more than 6
+    floor_m: float = 0.0001  # sigma of the error that successive frames share
+    floor_rad: float = 0.0001
+    merge_distance: float = 0.6  # Mahalanobis, between two means that become one
+    linear_rad: float = float(np.deg2rad(3.0))  # means this close merge; times the range for shifts
+    forget_log_weight: float = -20.0  # lighter hypotheses are dropped
+    outlier_log_evidence: float = -7.0  # bounds what one frame subtracts from a log-weight
+    max_inflation: float = 10.0  # largest factor on covariances where all hypotheses misfit
+    max_misfit: float = np.inf  # largest factor on the corners' sigma where no pose fits them
+    gate: float = 30.0  # excess cost over the best candidate; above it a frame fits no hypothesis
+    far_rad: float = float(np.deg2rad(20.0))
+    decided_mass: float = 3e-5
+    decided_sigma_rad: float = float(np.deg2rad(12.0))
+
+    def __check_init__(self) -> None:
+        least = CANDIDATES + 2
+        if self.hypotheses < least:
+            raise ValueError(f"hypotheses must be at least {least}: a fan and the candidates")
+        evidence, mass = self.outlier_log_evidence, self.decided_mass
+        known = isinstance(evidence, float) and isinstance(mass, float) and mass > 0
+        if known and evidence <= np.log(mass):
+            raise ValueError(
+                f"a single frame would decide: exp(outlier_log_evidence), {np.exp(evidence):.2g}, "
+                f"must be above decided_mass, {mass:.2g}"
+            )
+
+    def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
+        """Correct the pose of each hypothesis by the corners, and weigh it by its evidence.
+
+        Args:
+            prior: K predicted hypotheses; a fan replaces them where none is initialised.
+            candidates: N poses of this observation.
+            snapshot: the observation with its rig and map.
+
+        Returns:
+            A `PosePosterior` for each hypothesis, with weights, heirs and `decided`.
+        """
+        any_seen = jnp.any(snapshot.seen.visible)
+        snapshot = self._trusted(snapshot, candidates)
+        starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
+        count, bank = prior.log_weight.shape[0], prior
+        if count == self.hypotheses:  # a bank is cut only where none of its hypotheses starts
+            bank = _started(starts, prior, candidates, snapshot)
+        floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
+        # All slots take as many steps as the slowest, so an empty slot repeats the heaviest one.
+        alive_before = jnp.where(bank.initialised, bank.log_weight, -jnp.inf)
+        heaviest = first_highest(alive_before, EVEN_LOG_WEIGHT)
+        own = jnp.arange(count)
+        does_as = jnp.where(bank.initialised, own, heaviest)
+        predicted = _at(_poses(bank), does_as)
+        second = self.second_poses(bank, heaviest, candidates, snapshot)
+        tried = give_slots(second, ~bank.initialised & ~starts)
+        fits = fit_poses(
+            predicted.T_world_vehicle,
+            predicted.covariance,
+            jax.tree.map(lambda leaf: leaf[does_as], bank.errors),
+            prior,
+            snapshot,
+            floor,
+            self.max_steps,
+            tried,
+        )
+        alive = bank.initialised & fits.finite
+        inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
+        free_cost = candidates.least_cost
+        posteriors = _contradicted(_inflated(fits.posterior, inflation), fits.cost - free_cost)
+        fits_one = starts | (jnp.min(jnp.where(alive, fits.cost, jnp.inf)) - free_cost < self.gate)
+        passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
+        log_evidence = _log_evidence(fits, inflation)
+        evidence = self._bounded(log_evidence, alive & fits_one)
+        log_weight = jnp.where(alive, bank.log_weight + evidence, -jnp.inf)
+
+        # A second posterior shares its parent's prediction, and is no surer of it than the parent.
+        branches = tried.taken & fits.finite & passes & fits_one & alive[does_as]
+        fitted = _poses(fits.posterior).T_world_vehicle
+        of_parent = _at(_poses(fits.posterior), does_as).T_world_vehicle
+        branches = branches & (jax.vmap(rotation_error_rad)(fitted, of_parent) > self.linear_rad)
+        lighter = jnp.minimum(log_evidence - log_evidence[does_as], -2 * EVEN_LOG_WEIGHT)
+        log_weight = jnp.where(branches, log_weight[does_as] + lighter, log_weight)
+        log_weight = normalise(log_weight)
+        alive = (alive | branches) & (log_weight > self.forget_log_weight)
+
+        # A hypothesis whose pose the gate rejects stays where it was predicted.
+        after = where(passes, _poses(posteriors), predicted)
+        best = first_highest(log_weight, EVEN_LOG_WEIGHT)
+        T_best = _at(after, best).T_world_vehicle
+        apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
+        sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
+        mass = jnp.where(alive, jnp.exp(log_weight), 0)
+        far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
+        known_rad = safe_sqrt(jnp.sum(mass * (sigmas_rad**2 + apart_rad**2)))
+        to_best_rad = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_best))(
+            candidates.T_vehicle_world
+        )
+        costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
+        nearest = first_highest(-costs, EVEN_RAD)
+        wrong = jnp.maximum(
+            beyond(self.far_rad, apart_rad, sigmas_rad),
+            # Candidates of a spoilt frame are of no branch.
+            jnp.where(
+                fits_one,
+                nearer_to_another(after.T_world_vehicle, after.covariance, candidates, nearest),
+                0,
+            ),
+        )
+        flip_probability = jnp.sum(mass * wrong)
+        located = jnp.any(alive)
+        heir = own
+        if count > 1:
+            heir = jax.lax.cond(
+                jnp.sum(alive) > 1,
+                lambda: find_heirs(
+                    after.T_world_vehicle,
+                    after.covariance,
+                    jnp.where(alive, log_weight, -jnp.inf),
+                    self._linear(after.T_world_vehicle, snapshot),
+                    prior.freedom,
+                    self.merge_distance,
+                ),
+                lambda: own,
+            )
+        return Selection(
+            measured=eqx.tree_at(lambda m: m.valid, posteriors, alive & any_seen),
+            kept=alive & ~starts,
+            log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
+            heir=mark_found(heir),
+            costs=costs,
+            selected=jnp.where(jnp.any(candidates.valid) & located, nearest, -1),
+            flip_probability=jnp.where(located, flip_probability, 0),
+            decided=located & (far < self.decided_mass) & (known_rad < self.decided_sigma_rad),
+            parent=jnp.where(branches & alive, does_as, own),
+        )
+
+    def second_poses(
+        self,
+        bank: PoseBelief,
+        heaviest: Int[Array, ""] | int,
+        candidates: Candidates,
+        snapshot: Snapshot,
+    ) -> SecondPoses:
+        """The candidates for which a bank takes empty slots.
+
+        None while the bank is open, when others stand for them, and none where all misfit.
+        """
+        second = second_poses(bank, heaviest, candidates, self.forget_log_weight)
+        settled = bank.log_weight[heaviest] > np.log(0.5) + EVEN_LOG_WEIGHT
+        fits = _misfit(candidates, snapshot) < _TELLS_BRANCHES**2
+        return second._replace(wanted=second.wanted & settled & fits)
+
+    def _trusted(self, snapshot: Snapshot, candidates: Candidates) -> Snapshot:
+        """The snapshot with the corners' sigma raised where no pose explains the corners.
+
+        Where the cost of the best candidate exceeds its chi-square by three sigmas, the sigma is
+        multiplied so that it does not: the marker is blurred, bent or half hidden.
+        """
+        scale = jnp.minimum(jnp.sqrt(_misfit(candidates, snapshot)), self.max_misfit)
+        sigma_px = snapshot.seen.sigma_px * scale
+        return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, sigma_px)
+
+    def _inflation(
+        self, fits: PoseFit, alive: Bool[Array, " K"], starts: Array, freedom: int
+    ) -> Float[Array, ""]:
+        """Factor, at least 1, by which the covariances of prediction and corners are too small.
+
+        It is the least NIS of the hypotheses over three sigmas of its chi-square. Where even that
+        one is contradicted, all hypotheses share one error: wheels slip, a stamp is late, a camera
+        has turned.
+        """
+        least = jnp.min(jnp.where(alive, _nis(fits.posterior), jnp.inf))
+        known = jnp.isfinite(least) & ~starts
+        excess = excess_of(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
+        return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
+
+    def _bounded(
+        self, log_evidence: Float[Array, " K"], compared: Bool[Array, " K"]
+    ) -> Float[Array, " K"]:
+        """Bounded change of each log-weight by this frame; 0 for those that are not compared."""
+        best = jnp.max(jnp.where(compared, log_evidence, -jnp.inf))
+        bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
+        return jnp.where(compared, bounded, 0)
+
+    def _linear(self, T: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "K 6"]:
+        """Shifts and turns so small that the corners are linear in them, of poses (K,), m and rad.
+
+        A shift looks the larger the nearer the marker is.
+        """
+        to_markers = snapshot.markers.Ts_world_marker.translation()[None]
+        nearest_m = jnp.min(safe_norm(T.translation()[:, None] - to_markers), axis=1)
+        turns = jnp.full((nearest_m.shape[0], 3), self.linear_rad)
+        return jnp.concatenate([self.linear_rad * jnp.tile(nearest_m[:, None], 3), turns], 1)
+
+
+def _started(
+    starts: Bool[Array, ""], prior: PoseBelief, candidates: Candidates, snapshot: Snapshot
+) -> PoseBelief:
+    """The prediction, or a new fan where no hypothesis is initialised; computed only there."""
+
+    def changing(bank: PoseBelief) -> tuple[Any, ...]:
+        pose = bank.T_world_vehicle.wxyz_xyz, bank.covariance
+        return *pose, bank.log_weight, bank.initialised, bank.errors
+
+    wxyz_xyz, *rest = jax.lax.cond(
+        starts,
+        lambda: changing(fan(prior, candidates, snapshot, prior.log_weight.shape[0])),
+        lambda: changing(prior),
+    )
+    return eqx.tree_at(changing, prior, (wxyz_xyz, *rest), is_leaf=lambda leaf: leaf is None)
+
+
+def _log_evidence(fits: PoseFit, inflation: Float[Array, ""]) -> Float[Array, " K"]:
+    """Laplace's evidence, with the NIS by covariances as inflated."""
+    forgiven = jnp.where(fits.finite, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
+    return fits.log_evidence + forgiven
+
+
+def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:
+    return jnp.sum(posteriors.innovation**2, axis=1)
+
+
+def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePosterior:
+    return eqx.tree_at(
+        lambda p: (p.covariance, p.inflation),
+        posteriors,
+        (posteriors.covariance * inflation, posteriors.inflation * inflation),
+    )
+
+
+def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> PosePosterior:
+    """The posteriors with a NIS of at least their excess cost over the best candidate.
+
+    Where residuals are linear the NIS is that excess, plus what the prediction pays. In the wrong
+    one of two minima it is small as long as the prediction is wide, but the image contradicts it.
+    """
+    nis = _nis(posteriors)
+    more = (excess > nis) & (nis > 0)
+    growth = jnp.sqrt(jnp.where(more, excess / jnp.where(more, nis, 1), 1))
+    return eqx.tree_at(lambda p: p.innovation, posteriors, posteriors.innovation * growth[:, None])
+
+
+def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
+    """The `excess_of` of the best candidate's cost; 1 without a candidate."""
+    cost = candidates.least_cost
+    freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
+    return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
+
+
+class _Poses(eqx.Module):
+    T_world_vehicle: jaxlie.SE3  # batch axis (K,)
+    covariance: Float[Array, "*K 6 6"]
+
+
+def _poses(of: PoseBelief | PosePosterior) -> _Poses:
+    return _Poses(of.T_world_vehicle, of.covariance)
+
+
+def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
+    chosen: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
+    return chosen

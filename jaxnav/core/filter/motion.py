@@ -1,0 +1,214 @@
+"""Motion models: how a bank of hypotheses moves, and how a pose and the odometry correct it.
+
+They share one interface, so that `step` and the selectors do not depend on the state:
+
+    bank = motion.init(hypotheses)
+    bank = motion.predict(bank, obs)                  # by dt_s, then the odometry, if any
+    prior = motion.poses(bank)                        # poses and covariances, for a selector
+    updated = motion.update(bank, selection, obs)
+    covariance = motion.error_covariance(bank, best)  # of the pose that is reported
+
+A bank has K hypotheses along the leading axis of every leaf. `bicycle_kalman.py` is for cars,
+`constant_velocity.py` for everything else.
+"""
+
+import abc
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.core.filter.ambiguity import PoseBelief, PoseMeasurement, PosePosterior, Selection
+from jaxnav.core.filter.bank import Bank, branched, restart_broken
+from jaxnav.core.filter.camera_errors import EACH
+from jaxnav.core.filter.gate import Moments, Offer, apply_gate
+from jaxnav.core.filter.merging import merge_heirs
+from jaxnav.core.linalg.small_matrices import (
+    sandwich,
+)
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.pose.observation import Observation
+
+
+class BankUpdate(NamedTuple):
+    """A bank after an observation, and the outcome of the gate for each hypothesis."""
+
+    bank: Bank
+    nis: Float[Array, " K"]  # of the offered pose; 0 without a pose or a prediction
+    accepted: Bool[Array, " K"]  # the pose was inside the gate, or started the hypothesis
+    log_likelihood: Float[Array, " K"]  # of the pose given the prediction, up to a constant; or 0
+
+
+class Planar(NamedTuple):
+    """Planar pose and velocity of a vehicle, with their covariances."""
+
+    pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
+    pose_covariance: Float[Array, "3 3"]
+    velocity: Float[Array, " 3"]  # v_x_mps, v_y_mps, psi_dot_radps in the world
+    velocity_covariance: Float[Array, "3 3"]
+
+
+class Motion(eqx.Module):
+    """Base class of the motion models: the abstract methods differ, the others are shared."""
+
+    states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
+
+    @abc.abstractmethod
+    def init(self, hypotheses: int = 1) -> Bank:
+        """Hypotheses that have seen nothing."""
+
+    @abc.abstractmethod
+    def predict(self, bank: Bank, obs: Observation) -> Bank:
+        """The bank at this observation, before its corners are looked at."""
+
+    @abc.abstractmethod
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
+        """One hypothesis at this observation, before its readings: F P F' + Q, linear in P.
+
+        What moves the hypothesis, as odometry that tells the motion does, belongs to it.
+        """
+
+    def sound(self, bank: Bank) -> Bank:
+        """The bank whose hypotheses that are not finite begin anew."""
+        return restart_broken(bank, self.init(bank.initialised.shape[0]))
+
+    @abc.abstractmethod
+    def lost(self, bank: Bank) -> Bool[Array, " K"]:
+        """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
+
+    @abc.abstractmethod
+    def poses(self, bank: Bank) -> PoseBelief:
+        """Poses, covariances and weights of the hypotheses, for a selector."""
+
+    @abc.abstractmethod
+    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has chosen a candidate."""
+
+    @abc.abstractmethod
+    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
+        """The offer to one hypothesis whose selector has corrected its pose."""
+
+    @abc.abstractmethod
+    def start(
+        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
+    ) -> Moments:
+        """One hypothesis that begins at a measured pose."""
+
+    @abc.abstractmethod
+    def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
+        """The error state that leads from one mean to another."""
+
+    @abc.abstractmethod
+    def moved(self, base: Float[Array, " n"], error: Float[Array, " d"]) -> Float[Array, " n"]:
+        """The mean to which an error state leads."""
+
+    @abc.abstractmethod
+    def T_world_vehicle(self, mean: Float[Array, " n"]) -> jaxlie.SE3:
+        """The pose of a mean."""
+
+    @abc.abstractmethod
+    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+        """(x_m, y_m, psi_rad) of a mean in the world, and their derivatives."""
+
+    @abc.abstractmethod
+    def for_rig(self, rig: CameraRig, hypotheses: int) -> "Motion":
+        """The model with the errors of this rig's cameras among its states, and of the sensors.
+
+        A single hypothesis has neither: a rule that takes one pose doubts nothing.
+        """
+
+    @abc.abstractmethod
+    def learns(self, bank: Bank) -> Bool[Array, ""]:
+        """Whether the errors that are only considered at first are estimated by now."""
+
+    def considered(self, learns: Bool[Array, ""], before: Moments, after: Moments) -> Moments:
+        """The posterior whose errors keep their mean and covariance unless the model `learns`.
+
+        Pose and velocity are corrected by their own gain, and stay correlated with the errors.
+
+        Source: Schmidt (1966), "Application of state-space methods to navigation problems".
+        """
+        (x, P), (mean, covariance) = before, after
+        states = self.states
+        gap = x.shape[0] - P.shape[0]
+        errors = jnp.where(learns, mean[states + gap :], x[states + gap :])
+        block = jnp.where(learns, covariance[states:, states:], P[states:, states:])
+        return (
+            mean.at[states + gap :].set(errors),
+            covariance.at[states:, states:].set(block),
+        )
+
+    def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "d d"]) -> Planar:
+        """Pose and velocity on the ground: J P J' with the Jacobians of `on_ground`.
+
+        Args:
+            mean: (n,) as the model stores it.
+            covariance: (d, d) of the error state.
+        """
+        P, still = covariance, jnp.zeros(covariance.shape[0], mean.dtype)
+        slopes = jax.jacfwd(lambda error: self.on_ground(self.moved(mean, error)))(still)
+        (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
+        return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
+
+    def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
+        """The posterior of every hypothesis (Eqs. 10 and 11), with those of one heir merged.
+
+        A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
+        NIS is inside the gate, and counted as a rejection where it is not.
+
+        Args:
+            bank: predicted.
+            selection: what each hypothesis takes as measured, its weight and its heir.
+            obs: the observation; its odometry gives a hypothesis that starts its velocity.
+        """
+        if selection.parent is not None:
+            bank = branched(bank, selection.parent)
+        bank = eqx.tree_at(
+            lambda b: (b.log_weight, b.initialised), bank, (selection.log_weight, selection.kept)
+        )
+        measured = selection.measured
+        offer = self.follow if isinstance(measured, PosePosterior) else self.measure
+        learns = self.learns(bank)
+
+        def one(before: Bank, measured: Any, first: Moments) -> BankUpdate:
+            offered = offer(before, measured, obs)
+            predicted = before.mean, before.covariance
+            posterior = self.considered(learns, predicted, offered.posterior)
+            offered = offered._replace(posterior=posterior)
+            after, nis, accepted = apply_gate(before, offered, first, measured.valid)
+            compared = measured.valid & before.initialised
+            return BankUpdate(after, nis, accepted, jnp.where(compared, offered.log_likelihood, 0))
+
+        # In few frames a hypothesis starts.
+        first = jax.lax.cond(
+            jnp.any(measured.valid & ~bank.initialised),
+            lambda: jax.vmap(lambda b, pose: self.start(b, pose, obs))(bank, measured),
+            lambda: (bank.mean, bank.covariance),
+        )
+        updated: BankUpdate = jax.vmap(one)(bank, measured, first)
+        bank = merge_heirs(updated.bank, selection.heir, self.difference, self.moved)
+        return updated._replace(bank=bank)
+
+    def error_covariance(self, bank: Bank, index: Int[Array, ""]) -> Float[Array, "d d"]:
+        """Expected squared error of one hypothesis: the second moment of the bank about its mean.
+
+            sum_k w_k (P_k + d_k d_k'),    d_k = difference(mean_k, mean_index).
+
+        Source: Bar-Shalom, Li, Kirubarajan (2001), section 1.4.16 (moments of a mixture).
+        """
+        mass = jnp.where(bank.initialised, jnp.exp(bank.log_weight), 0)
+        total = jnp.sum(mass)
+        share = jnp.where(total > 0, mass / jnp.where(total > 0, total, 1), 0)
+        share = jnp.where(total > 0, share, jnp.arange(mass.shape[0]) == index)
+        apart = jax.vmap(lambda mean: self.difference(mean, bank.mean[index]))(bank.mean)
+        apart = jnp.where((share > 0)[:, None], apart, 0)
+        squared = apart[:, :, None] * apart[:, None]
+        return jnp.sum(share[:, None, None] * (bank.covariance + squared), axis=0)
+
+
+def camera_states(rig: CameraRig, hypotheses: int) -> int:
+    """How many errors of a rig's cameras a bank keeps: none where the cameras are exact."""
+    return 0 if rig.extrinsics_sigma is None or hypotheses == 1 else EACH * len(rig)

@@ -1,0 +1,133 @@
+"""The 3-DOF bicycle: how speed and steering move the vehicle.
+
+The reference point lies midway between the axles (Lf = Lr), where the paper puts the centre
+of gravity. Source: Liu, Schofield, Shan (2023), Eqs. 4-7.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxnav.core.models.geometry import safe_sinc
+from jaxnav.core.models.gyro import Gyro
+
+# Errors of the sensors that a filter keeps, and their standard deviations where nobody says.
+SENSOR_ERRORS = ("speed_scale", "steering_gain", "steering_offset_rad", "camera_delay_s")
+SENSORS_AS_TOLD = np.asarray([0.03, 0.03, np.deg2rad(0.5), 0.02])
+
+
+class Vehicle(eqx.Module):
+    """Parameters of one vehicle, for the estimator, the controller and the simulated car."""
+
+    wheelbase_m: Float[Array, ""]
+    steering_limit_rad: Float[Array, ""]  # |steering| never exceeds it
+    steering_rate_limit_radps: Float[Array, ""]
+    throttle_limit: Float[Array, ""]  # in the driver's unit (QCar: PWM duty)
+    speed_per_throttle_mps: Float[Array, ""]  # steady-state speed at throttle 1
+    speed_time_constant_s: Float[Array, ""]  # first-order lag from throttle to speed
+    # Standard deviations of what is left of the errors below, as in `SENSORS_AS_TOLD`; None: the
+    # sensors are exact but for white noise.
+    sensor_sigma: Float[Array, " 4"] | None = None
+    gyro: Gyro | None = None
+    # Calibration of its sensors. `jaxnav.drive.corrections` applies it; the core reads corrected
+    # values only.
+    speed_scale: float = eqx.field(static=True, default=1.0)  # true speed per speed read
+    steering_gain: float = eqx.field(static=True, default=1.0)  # true angle per angle read
+    steering_offset_rad: float = eqx.field(static=True, default=0.0)  # true angle where 0 is read
+    camera_delay_s: float = eqx.field(static=True, default=0.0)  # cameras' stamp less odometer's
+
+    @staticmethod
+    def create(
+        wheelbase_m: float,
+        steering_limit_rad: float,
+        throttle_limit: float,
+        speed_per_throttle_mps: float,
+        speed_time_constant_s: float,
+        steering_rate_limit_radps: float = 5.0,  # a hobby servo: 60 degrees in 0.2 s
+        speed_scale: float = 1.0,
+        steering_gain: float = 1.0,
+        steering_offset_rad: float = 0.0,
+        camera_delay_s: float = 0.0,
+        sensor_sigma: Float[Array | np.ndarray, " 4"] | None = None,
+        gyro: Gyro | None = None,
+    ) -> "Vehicle":
+        """A vehicle from plain numbers."""
+        return Vehicle(
+            jnp.asarray(wheelbase_m, float),
+            jnp.asarray(steering_limit_rad, float),
+            jnp.asarray(steering_rate_limit_radps, float),
+            jnp.asarray(throttle_limit, float),
+            jnp.asarray(speed_per_throttle_mps, float),
+            jnp.asarray(speed_time_constant_s, float),
+            None if sensor_sigma is None else jnp.asarray(sensor_sigma, float),
+            gyro,
+            speed_scale=float(speed_scale),
+            steering_gain=float(steering_gain),
+            steering_offset_rad=float(steering_offset_rad),
+            camera_delay_s=float(camera_delay_s),
+        )
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Of its numbers."""
+        return self.wheelbase_m.dtype
+
+
+def sideslip_rad(steering_rad: Float[Array, ""]) -> Float[Array, ""]:
+    """Sideslip beta, rad, the angle of the velocity in the vehicle frame (Eq. 4).
+
+    beta = atan(tan(steering) / 2)
+    """
+    return jnp.arctan(jnp.tan(steering_rad) / 2)
+
+
+def curvature_per_m(
+    steering_rad: Float[Array, ""], wheelbase_m: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Curvature of the path, 1/m: 1 / R_r = cos(beta) tan(steering) / l (Eq. 5).
+
+    It is finite when driving straight; l is the wheelbase.
+    """
+    return jnp.cos(sideslip_rad(steering_rad)) * jnp.tan(steering_rad) / wheelbase_m
+
+
+def velocity_world(
+    speed_mps: Float[Array, ""],
+    steering_rad: Float[Array, ""],
+    psi_rad: Float[Array, ""],
+    wheelbase_m: Float[Array, ""],
+) -> Float[Array, " 3"]:
+    """(v_x m/s, v_y m/s, psi_dot rad/s) in the world at heading psi (Eqs. 6 and 7).
+
+    v_x = v cos(psi + beta),  v_y = v sin(psi + beta),  psi_dot = v / R_r
+    """
+    course_rad = psi_rad + sideslip_rad(steering_rad)
+    return speed_mps * jnp.stack(
+        [
+            jnp.cos(course_rad),
+            jnp.sin(course_rad),
+            curvature_per_m(steering_rad, wheelbase_m),
+        ]
+    )
+
+
+def advance(
+    pose: Float[Array, " 3"],
+    speed_mps: Float[Array, ""],
+    steering_rad: Float[Array, ""],
+    dt_s: Float[Array, ""],
+    wheelbase_m: Float[Array, ""],
+) -> Float[Array, " 3"]:
+    """(x_m, y_m, psi_rad) after dt at constant speed and steering, exactly along the arc.
+
+    The chord of an arc that turns by a has the direction of its middle and the length
+    s sin(a/2) / (a/2).
+    """
+    distance_m = speed_mps * dt_s
+    half_turn = distance_m * curvature_per_m(steering_rad, wheelbase_m) / 2
+    chord_m = distance_m * safe_sinc(half_turn)
+    direction = pose[2] + sideslip_rad(steering_rad) + half_turn
+    return pose + jnp.stack(
+        [chord_m * jnp.cos(direction), chord_m * jnp.sin(direction), 2 * half_turn]
+    )

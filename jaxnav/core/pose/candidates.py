@@ -1,0 +1,210 @@
+"""Candidate poses of the vehicle: both IPPE poses of every sighting, refined and merged.
+
+Source: Liu, Schofield, Shan (2023), Algorithm 1, "get both possible poses using the IPPE method
+and Eq. 3".
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax.typing import DTypeLike
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.core.linalg.small_matrices import in_order
+from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.geometry import (
+    on_ground,
+    rotation_matrix,
+    safe_norm,
+    safe_sqrt,
+    transform_points,
+)
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.pose.ippe import ippe_from_rays
+from jaxnav.core.pose.observation import Sightings, Snapshot, cameras_of
+from jaxnav.core.pose.refine import refine_sightings
+from jaxnav.core.pose.residuals import reprojection_residuals
+
+# Two local minima this close are merged: 1.1 degrees, and 0.02 of the distance to the marker.
+SAME_POSE_RAD = 0.02
+
+
+class Candidates(eqx.Module):
+    """N poses of the vehicle, sorted by e1. Lanes that are not `valid` hold finite numbers.
+
+    `cost` is what the refinement minimised, whitened by the corners' sigma; `e1_px2` is the
+    paper's.
+    """
+
+    T_vehicle_world: jaxlie.SE3  # batch axis (N,)
+    e1_px2: Float[Array, " N"]
+    cost: Float[Array, " N"]  # sum of (residual / sigma)^2
+    covariance: Float[Array, "N 6 6"]  # of xi in T_world_vehicle * exp(xi)
+    valid: Bool[Array, " N"]
+    converged: Bool[Array, " N"]
+    steps: Int[Array, " N"]
+
+    @staticmethod
+    def none(count: int, dtype: DTypeLike) -> "Candidates":
+        """`count` lanes, none of them valid."""
+        zeros = jnp.zeros(count, dtype)
+        return Candidates(
+            T_vehicle_world=jaxlie.SE3(jnp.zeros((count, 7), dtype).at[:, 0].set(1)),
+            e1_px2=zeros,
+            cost=zeros,
+            covariance=jnp.zeros((count, 6, 6), dtype),
+            valid=zeros > 0,
+            converged=zeros > 0,
+            steps=jnp.zeros(count, int),
+        )
+
+    @property
+    def least_cost(self) -> Float[Array, ""]:
+        """The cost of the best candidate; inf without one."""
+        return jnp.min(jnp.where(self.valid, self.cost, jnp.inf))
+
+    def padded(self, count: int) -> "Candidates":
+        """The candidates with lanes appended up to `count`, which are not valid."""
+        kept = self.valid.shape[0]
+        more = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
+        )
+        return eqx.tree_at(lambda c: c.valid, more, more.valid & (jnp.arange(count) < kept))
+
+
+def find_candidates(
+    snapshot: Snapshot,
+    max_candidates: int = 4,
+    max_steps: int = 12,
+    ground_plane: bool = False,
+    own: jaxlie.SE3 | None = None,
+) -> Candidates:
+    """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
+
+    One camera that sees one marker gives two; two cameras on one marker give up to four, which
+    the refinement usually draws together into two (see docs/design.md, Candidates). With many
+    markers the `max_candidates` poses that explain all corners best are refined.
+
+    Args:
+        snapshot: what is seen.
+        max_candidates: N, how many poses are refined and returned at most.
+        max_steps: bound on the LM steps.
+        ground_plane: keep the vehicle level on the ground, z = 0: only (x, y, psi) are refined.
+        own: the result of `both_poses(snapshot)`, where the caller has it already.
+    """
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
+    own = both_poses(snapshot) if own is None else own
+    Ts_vehicle_world = jaxlie.SE3(own.wxyz_xyz.reshape(-1, 7))
+    owner_visible = jnp.repeat(seen.visible, 2)
+    if ground_plane:
+        Ts_vehicle_world = jax.vmap(lambda T: on_ground(T.inverse()).inverse())(Ts_vehicle_world)
+
+    residuals = reprojection_residuals(rig, seen)
+
+    def joint_e1(T_vehicle_world: jaxlie.SE3) -> Array:
+        corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
+        return jnp.sum(residuals(corners_vehicle) ** 2)
+
+    count = min(max_candidates, owner_visible.shape[0])
+    if count < owner_visible.shape[0]:
+        first_guess = jnp.where(owner_visible, jax.vmap(joint_e1)(Ts_vehicle_world), jnp.inf)
+        best = in_order(-first_guess, count)
+        Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
+        owner_visible = owner_visible[best]
+
+    refined = refine_sightings(
+        rig, markers, seen, Ts_vehicle_world, max_steps, ground_plane, wanted=owner_visible
+    )
+    e1_px2 = refined.e1_px2
+    # Corners far outside of any image can overflow; such a lane is no candidate.
+    finite = jnp.isfinite(e1_px2) & jnp.isfinite(refined.cost)
+    valid = owner_visible & finite
+    # Of several sightings, what still falls after the last step is on its way from the minimum of
+    # one to that of all. Of one it is near its own: two that are about to become one are flat.
+    alone = jnp.sum(seen.visible) < 2
+    valid &= refined.converged | alone | ~jnp.any(valid & refined.converged)
+    e1_px2 = jnp.where(finite, e1_px2, 0)
+    refined = eqx.tree_at(lambda r: r.cost, refined, jnp.where(finite, refined.cost, 0))
+    order = in_order(-jnp.where(valid, e1_px2, jnp.inf), count)
+    refined, e1_px2, valid = jax.tree.map(lambda leaf: leaf[order], (refined, e1_px2, valid))
+    return Candidates(
+        T_vehicle_world=refined.T_vehicle_world,
+        e1_px2=e1_px2,
+        cost=refined.cost,
+        covariance=refined.covariance,
+        valid=valid & ~_repeats(refined.T_vehicle_world, seen, markers, valid),
+        converged=refined.converged,
+        steps=refined.steps,
+    )
+
+
+def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
+    """RMS distance (D,), px, of each sighting's corners to the better of its own two poses.
+
+    It is large where the corners are not the image of a square.
+
+    Args:
+        snapshot: what is seen.
+        own: `both_poses(snapshot)`.
+    """
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
+
+    def one(
+        camera: Camera, T_camera_vehicle: jaxlie.SE3, Ts: jaxlie.SE3, corners: Array, px: Array
+    ) -> Array:
+        def error(T_vehicle_world: jaxlie.SE3) -> Array:
+            corners_camera = transform_points(T_camera_vehicle @ T_vehicle_world, corners)
+            return jnp.mean(jnp.sum((camera.project(corners_camera) - px) ** 2, axis=1))
+
+        return jnp.min(jax.vmap(error)(Ts))
+
+    squared = jax.vmap(one)(
+        *cameras_of(rig, seen),
+        own,
+        markers.corners_world_m[seen.marker_index],
+        seen.corners_px,
+    )
+    return safe_sqrt(squared)
+
+
+def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
+    """Both IPPE poses `T_vehicle_world` of every sighting by itself, batch axes (D, 2).
+
+    Sightings that are not visible give finite poses without a meaning.
+    """
+    rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
+
+    def one(
+        T_camera_vehicle: jaxlie.SE3, T_world_marker: jaxlie.SE3, size_m: Array, rays: Array
+    ) -> jaxlie.SE3:
+        Ts_camera_marker = ippe_from_rays(rays, size_m)
+        return jax.vmap(
+            lambda T_camera_marker: (
+                T_camera_vehicle.inverse() @ T_camera_marker @ T_world_marker.inverse()
+            )
+        )(Ts_camera_marker)
+
+    return jax.vmap(one)(
+        cameras_of(rig, seen)[1],
+        jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[seen.marker_index]),
+        markers.size_m[seen.marker_index],
+        seen.rays,
+    )
+
+
+def _repeats(
+    T_vehicle_world: jaxlie.SE3, seen: Sightings, markers: MarkerMap, valid: Bool[Array, " N"]
+) -> Bool[Array, " N"]:
+    """Whether an earlier valid lane holds the same pose, within `SAME_POSE_RAD`."""
+    first_seen = seen.marker_index[jnp.argmax(seen.visible)]
+    center_world = markers.Ts_world_marker.translation()[first_seen]
+    centers_vehicle = jax.vmap(lambda T: transform_points(T, center_world))(T_vehicle_world)
+    range_m = jnp.maximum(safe_norm(centers_vehicle), 1e-3)
+    R = jax.vmap(rotation_matrix)(T_vehicle_world.rotation())
+    # |R_i - R_j|_F = 2 sqrt(2) sin(angle / 2)
+    turn = safe_norm((R[:, None] - R[None]).reshape(*R.shape[:1], *R.shape[:1], 9)) / jnp.sqrt(2.0)
+    shift = safe_norm(centers_vehicle[:, None] - centers_vehicle[None]) / range_m[:, None]
+    same = (turn < SAME_POSE_RAD) & (shift < SAME_POSE_RAD)
+    earlier = jnp.tri(same.shape[0], k=-1, dtype=bool)
+    return jnp.any(same & earlier & valid[None], axis=1)

@@ -1,0 +1,114 @@
+"""Compile a navigator's functions once on a machine: `Navigator.step`, and others."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
+
+from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.navigator import Navigator, Step, jitted_step
+from jaxnav.files import executables
+from jaxnav.files.executable_bytes import Run
+
+
+def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
+    """`jax.jit(navigator.step)`, whose first call loads what another process has compiled.
+
+    See `compile_or_load`.
+    """
+    if folder is None:
+        return partial(jitted_step, navigator)
+    return compile_or_load(Navigator.step, navigator, folder)
+
+
+def compile_or_load(
+    function: Callable[..., PyTree], navigator: Navigator, folder: Path | None
+) -> Callable[..., PyTree]:
+    """`jax.jit(function)` of a navigator, whose first call loads what another process has compiled.
+
+    Executables hold none of the navigator's numbers: a car that was calibrated anew loads what it
+    compiled before. The call raises TypeError when the arguments' shapes or types change from
+    call to call.
+
+    Args:
+        function: one of jaxnav's own, of a navigator and of further trees of arrays.
+        folder: folder of executables, see `keep_in`. Without one, or if the navigator has parts
+            that are not jaxnav's own, nothing is kept.
+
+    Returns:
+        The function of the further trees, with the navigator bound.
+    """
+    navigator = strip_static(navigator)
+    if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
+        return partial(_jitted(function), navigator)
+    numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
+    # A program for each structure of the arguments.
+    ready: dict[PyTreeDef, tuple[Run, PyTreeDef]] = {}
+
+    def call(*arguments: PyTree) -> PyTree:
+        leaves, given = jax.tree.flatten(arguments)
+        if given not in ready:
+            ready[given] = executables.program(function, (navigator, *arguments), folder)
+        program, returned = ready[given]
+        return jax.tree.unflatten(returned, program([*numbers, *leaves]))
+
+    return call
+
+
+def is_compiled(
+    function: Callable[..., PyTree], navigator: Navigator, folder: Path, *arguments: PyTree
+) -> bool:
+    """Whether `compile_or_load(function, navigator, folder)(*told)` finds its executable."""
+    return executables.is_kept(function, (strip_static(navigator), *arguments), folder)
+
+
+def strip_static(navigator: Navigator) -> Navigator:
+    """The navigator without its vehicle's sensor corrections, its map's origin and its markers'
+    names: these are static fields, not leaves, and nothing is computed with them."""
+
+    def without(part: PyTree) -> PyTree:
+        if isinstance(part, MarkerMap):
+            return part.without_names()
+        if not isinstance(part, Vehicle):
+            return part
+        return replace(
+            part,
+            speed_scale=1.0,
+            steering_gain=1.0,
+            steering_offset_rad=0.0,
+            camera_delay_s=0.0,
+        )
+
+    return jax.tree.map(
+        without, navigator, is_leaf=lambda part: isinstance(part, Vehicle | MarkerMap)
+    )
+
+
+@cache
+def _jitted(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """`jax.jit(function)`, cached: one program for all navigators of a structure."""
+    return jax.jit(function)
+
+
+def _is_ours(part: object) -> bool:
+    return isinstance(part, jaxlie.MatrixLieGroup) or type(part).__module__.startswith("jaxnav.")
+
+
+def _parts(module: object) -> Iterator[object]:
+    """Yield a module and all modules inside it."""
+    yield module
+    parts = jax.tree.leaves(
+        list(vars(module).values()) if isinstance(module, eqx.Module) else [],
+        is_leaf=lambda part: isinstance(part, eqx.Module | jaxlie.MatrixLieGroup),
+    )
+    for part in parts:
+        if isinstance(part, eqx.Module | jaxlie.MatrixLieGroup):
+            yield from _parts(part)

@@ -1,0 +1,162 @@
+"""Clamp commands to the limits of the vehicle, whatever was computed.
+
+A command is a tuple of numbers: a car's steering_rad and throttle, of another base forward_mps,
+left_mps and turn_radps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
+    from typing_extensions import TypeIs
+
+    from jaxnav.core.models.bicycle import Vehicle
+    from jaxnav.core.models.twist_base import TwistBase
+
+Command = tuple[float, ...]
+
+
+class CommandLimits(Protocol):
+    """The limits of one vehicle's commands."""
+
+    @property
+    def zero(self) -> Command:
+        """The command of a vehicle that has never moved."""
+        ...
+
+    def within(self, command: Command, before: Command, elapsed_s: float) -> Command:
+        """The command inside the limits; one that is not finite moves nothing.
+
+        Args:
+            before: the last command.
+            elapsed_s: time since then; 0 replaces a value that is not positive and finite.
+        """
+        ...
+
+    def slowed(self, command: Command, factor: float) -> Command:
+        """The command at a share of its speed."""
+        ...
+
+    def standing(self, command: Command) -> Command:
+        """The command of a vehicle that stands; a car keeps its wheels turned."""
+        ...
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits of one car's commands. Implements `CommandLimits`."""
+
+    steering_rad: float
+    steering_rate_radps: float
+    throttle: float
+
+    @staticmethod
+    def of(vehicle: Vehicle) -> Limits:
+        """The limits in a car's description."""
+        return Limits(
+            float(vehicle.steering_limit_rad),
+            float(vehicle.steering_rate_limit_radps),
+            float(vehicle.throttle_limit),
+        )
+
+    @property
+    def zero(self) -> Command:
+        """See `CommandLimits`."""
+        return 0.0, 0.0
+
+    def within(self, command: Command, before: Command, elapsed_s: float) -> Command:
+        """See `CommandLimits`."""
+        steering_rad, throttle = command
+        return self.apply(steering_rad, throttle, before[0], elapsed_s)
+
+    def slowed(self, command: Command, factor: float) -> Command:
+        """See `CommandLimits`."""
+        return command[0], command[1] * factor
+
+    def standing(self, command: Command) -> Command:
+        """See `CommandLimits`."""
+        return command[0], 0.0
+
+    def apply(
+        self, steering_rad: float, throttle: float, last_steering_rad: float, elapsed_s: float
+    ) -> tuple[float, float]:
+        """Steering and throttle inside the limits.
+
+        A command that is not finite gives zero throttle; such steering keeps its last value.
+
+        Args:
+            last_steering_rad: the steering angle commanded before.
+            elapsed_s: time since then; 0 replaces a value that is not positive and finite.
+        """
+        last = _clamped(last_steering_rad, self.steering_rad, 0.0)
+        steering = _clamped(steering_rad, self.steering_rad, last)
+        elapsed_s = elapsed_s if math.isfinite(elapsed_s) and elapsed_s > 0 else 0.0
+        step = min(self.steering_rate_radps * elapsed_s, 2 * self.steering_rad)
+        steering = min(max(steering, last - step), last + step)
+        drives = math.isfinite(steering_rad) and math.isfinite(throttle)
+        return steering, _clamped(throttle, self.throttle, 0.0) if drives else 0.0
+
+
+@dataclass(frozen=True)
+class TwistLimits:
+    """The limits of the commands of a base that is driven by a twist; see `CommandLimits`."""
+
+    forward_mps: float
+    left_mps: float
+    turn_radps: float
+
+    @staticmethod
+    def of(base: TwistBase) -> TwistLimits:
+        """The limits in a base's description."""
+        return TwistLimits(
+            float(base.forward_limit_mps),
+            float(base.left_limit_mps),
+            float(base.turn_limit_radps),
+        )
+
+    @property
+    def zero(self) -> Command:
+        """See `CommandLimits`."""
+        return 0.0, 0.0, 0.0
+
+    def within(self, command: Command, before: Command, elapsed_s: float) -> Command:
+        """See `CommandLimits`: each part is cut at its limit; all stand where one is no number."""
+        if not all(map(math.isfinite, command)):
+            return self.zero
+        forward, left, turn = command
+        return (
+            _clamped(forward, self.forward_mps, 0.0),
+            _clamped(left, self.left_mps, 0.0),
+            _clamped(turn, self.turn_radps, 0.0),
+        )
+
+    def slowed(self, command: Command, factor: float) -> Command:
+        """See `CommandLimits`."""
+        return tuple(part * factor for part in command)
+
+    def standing(self, command: Command) -> Command:
+        """See `CommandLimits`."""
+        return self.zero
+
+
+def turns_by_twist(vehicle: Vehicle | TwistBase) -> TypeIs[TwistBase]:
+    """Whether a vehicle's description, or its plain numbers, are those of a `TwistBase`."""
+    return "turn_limit_radps" in vars(vehicle)
+
+
+def limits_of(vehicle: Vehicle | TwistBase) -> Limits | TwistLimits:
+    """The limits in a vehicle's description."""
+    return TwistLimits.of(vehicle) if turns_by_twist(vehicle) else Limits.of(vehicle)
+
+
+def limits_from(numbers: Mapping[str, float]) -> Limits | TwistLimits:
+    """The limits of these fields, as another process has sent them."""
+    return TwistLimits(**numbers) if "turn_radps" in numbers else Limits(**numbers)
+
+
+def _clamped(value: float, limit: float, instead: float) -> float:
+    return min(max(value, -limit), limit) if math.isfinite(value) else instead

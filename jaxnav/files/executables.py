@@ -1,0 +1,184 @@
+"""Keep compiled programs in files, so that each is compiled only once on a machine.
+
+JAX's own cache spares a later process the compiler, but tracing and lowering take longer than
+loading an executable. So the executable itself is kept.
+
+    @kept
+    def project(camera, points): ...
+
+    keep_in(folder)  # called by a command; without it `kept` is `jax.jit`
+"""
+
+import hashlib
+import os
+import platform
+import re
+import time
+from collections.abc import Callable, Hashable
+from contextlib import suppress
+from functools import cache, update_wrapper
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import PyTreeDef
+from jaxtyping import PyTree
+
+from jaxnav.files.executable_bytes import NotStorableError, Run, from_bytes, to_bytes
+from jaxnav.files.private import NotPrivateError, PrivateFolder
+
+_KEPT = 64  # the last used executables, some MB each, are kept
+_NAME = re.compile(r"[0-9a-f]{64}\.step")
+_LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
+# Rooms that only call compiled programs or draw their results.
+_WITHOUT = (
+    "calibrate", "commands", "experiments", "pictures", "recordings/other", "vehicles/conformance",
+)  # fmt: skip
+PACKAGE = Path(__file__).resolve().parents[1]
+ASKED = "/jaxnav/executables/asked"  # JAX's listeners hear of it as of a compilation
+
+_folders: list[Path] = []  # the last one counts
+
+
+def keep_in(folder: Path | None) -> None:
+    """Load and keep the executables of `kept` functions in a folder from now on; None: nowhere.
+
+    Args:
+        folder: made if it is missing. Executables are run without a check: if anybody else may
+            write to it, or to anything on its path, nothing is loaded and nothing is kept, see
+            `PrivateFolder`.
+    """
+    _folders[:] = [] if folder is None else [folder]
+
+
+class kept:
+    """`jax.jit` of one of jaxnav's own functions of arrays and trees, with a kept executable."""
+
+    def __init__(self, function: Callable[..., PyTree]):
+        self.jitted = jax.jit(function)
+        self._function = function
+        self._ready: dict[Hashable, tuple[Run, PyTreeDef]] = {}
+        update_wrapper(self, function)
+
+    def __call__(self, *arguments: PyTree, **named: PyTree) -> PyTree:
+        leaves, given = jax.tree.flatten(arguments)
+        if not _folders or named or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self.jitted(*arguments, **named)
+        kind = given, *((leaf.shape, leaf.dtype) for leaf in leaves)
+        if kind not in self._ready:
+            self._ready[kind] = program(self._function, arguments, _folders[-1])
+        run, structure = self._ready[kind]
+        return jax.tree.unflatten(structure, run(leaves))
+
+
+def program(
+    function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path
+) -> tuple[Run, PyTreeDef]:
+    """The executable of a function on its arguments' leaves, and the structure of its result.
+
+    Loaded if another process has kept it, else compiled and kept.
+    """
+    jax.monitoring.record_event(ASKED)
+    given, inputs = _asked(arguments)
+    name = _file(_name(function, given), inputs)
+    return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)
+
+
+def is_kept(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path) -> bool:
+    """Whether `program` finds the executable in the folder."""
+    given, inputs = _asked(arguments)
+    with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
+        return files.holds(_file(_name(function, given), inputs))
+    return False
+
+
+@cache
+def sources_digest(package: Path, without: tuple[str, ...]) -> str:
+    """The digest of a package's sources, some folders left out, as of the first call in a process:
+    between two releases the version does not change."""
+    digest = hashlib.blake2b(digest_size=8)
+    for source in sorted(package.rglob("*.py")):
+        name = source.relative_to(package).as_posix()
+        if not name.startswith(tuple(f"{folder}/" for folder in without)):
+            digest.update(f"{name} ".encode() + source.read_bytes())
+    return digest.hexdigest()
+
+
+def _asked(arguments: tuple[PyTree, ...]) -> tuple[PyTreeDef, list[jax.ShapeDtypeStruct]]:
+    leaves, given = jax.tree.flatten(arguments)
+    return given, jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
+
+
+def _name(function: Callable[..., PyTree], given: PyTreeDef) -> str:
+    return str((f"{function.__module__}.{function.__qualname__}", given))
+
+
+def _compiled(
+    function: Callable[..., PyTree],
+    folder: Path,
+    name: str,
+    given: PyTreeDef,
+    inputs: list[jax.ShapeDtypeStruct],
+) -> tuple[Run, PyTreeDef]:
+    seen: list[PyTree] = []
+
+    def flat(leaves: list[jax.Array]) -> list[jax.Array]:
+        returned = function(*jax.tree.unflatten(given, leaves))
+        seen.append(returned)
+        return jax.tree.leaves(returned)
+
+    # A name that JAX's own cache has never seen: a program loaded from it runs, but lacks its
+    # kernels once it is stored again.
+    flat.__name__ = f"step_{time.time_ns()}"
+    run = jax.jit(flat).lower(inputs).compile()
+    # A loaded program does not find functions of other libraries, such as LAPACK's.
+    if "custom_call_target" not in (run.as_text() or ""):
+        with suppress(NotStorableError):
+            _keep(folder, name, to_bytes(run, seen[0]))
+    return run, jax.tree.structure(seen[0])
+
+
+def _loaded(
+    folder: Path, name: str, inputs: list[jax.ShapeDtypeStruct]
+) -> tuple[Run, PyTreeDef] | None:
+    try:
+        with PrivateFolder(folder) as files:
+            raw = files.read(name)
+        run, structure = from_bytes(raw, inputs)
+        blank = [np.zeros(like.shape, like.dtype) for like in inputs]
+        jax.block_until_ready(run(blank))  # a program that does not run here fails now
+    except Exception:  # none yet, none for this machine, or a foreign one: it is compiled anew
+        return None
+    return run, structure
+
+
+def _keep(folder: Path, name: str, raw: bytes) -> None:
+    """Write an executable completely or not at all, and keep only the `_KEPT` last used ones."""
+    # A full, foreign or unsafe disk is ignored: the program is in memory all the same.
+    with suppress(OSError, NotPrivateError), PrivateFolder(folder, make=True) as files:
+        files.write(name, raw)
+        ours = [name for name in files.names_by_use() if _NAME.fullmatch(name)]
+        for old in ours[:-_KEPT]:
+            files.remove(old)
+
+
+def _file(structures: str, leaves: list[jax.ShapeDtypeStruct]) -> str:
+    """The file name of an executable: a hash of all on which it depends."""
+    device = jax.devices()[0]
+    depends_on = [
+        structures,
+        [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
+        _versions(),
+        (device.platform, device.device_kind, platform.machine(), platform.node()),
+        str(jnp.zeros(()).dtype),
+        (os.environ.get("XLA_FLAGS"), os.environ.get("PJRT_NPROC")),
+        sources_digest(PACKAGE, _WITHOUT),
+    ]
+    return f"{hashlib.sha256(repr(depends_on).encode()).hexdigest()}.step"
+
+
+@cache
+def _versions() -> list[tuple[str, str]]:
+    return [(name, version(name)) for name in _LIBRARIES]

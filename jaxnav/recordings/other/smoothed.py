@@ -1,0 +1,164 @@
+"""The poses of a recording by all that was seen: back from the end through a filter's beliefs."""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.core.filter.bank import Bank, heaviest
+from jaxnav.core.filter.estimate import Belief, Estimate
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.filter.smoothing import Trail, doubt
+from jaxnav.core.linalg.small_matrices import first_highest
+from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.pose.observation import Observation
+
+
+class Kept(eqx.Module):
+    """What is kept of filtered frames to smooth them, leading axes (F, tracks) or none."""
+
+    belief: Belief  # without what repeats
+    candidates: Candidates
+
+    @staticmethod
+    def of(belief: Belief, estimate: Estimate) -> "Kept":
+        """What is kept of one frame."""
+        bare = eqx.tree_at(lambda b: b.repeats, belief, None, is_leaf=lambda leaf: leaf is None)
+        return Kept(bare, estimate.candidates)
+
+
+class Packed(NamedTuple):
+    """`Kept` on the host, moments of living hypotheses alone: of 24 slots one or two live."""
+
+    bare: Kept  # its bank without mean and covariance
+    lives: Bool[np.ndarray, "F tracks K"]
+    mean: Float[np.ndarray, "rows n"]
+    covariance: Float[np.ndarray, "rows d d"]
+
+    @staticmethod
+    def of(kept: Kept) -> "Packed":
+        """Pack frames."""
+        kept = jax.device_get(kept)
+        bank = kept.belief.bank
+        bare = eqx.tree_at(_moments, kept, (None, None))
+        lives, mean, covariance = map(np.asarray, (bank.initialised, bank.mean, bank.covariance))
+        return Packed(bare, lives, mean[lives], covariance[lives])
+
+    def unpack(self) -> Kept:
+        """The frames; hypotheses that don't live are zero."""
+        filled = []
+        for rows in (self.mean, self.covariance):
+            whole = np.zeros((*self.lives.shape, *rows.shape[1:]), rows.dtype)
+            whole[self.lives] = rows
+            filled.append(whole)
+        return eqx.tree_at(_moments, self.bare, tuple(filled), is_leaf=lambda leaf: leaf is None)
+
+
+def _moments(kept: Kept) -> tuple[Array, Array]:
+    return kept.belief.bank.mean, kept.belief.bank.covariance
+
+
+class Behind(eqx.Module):
+    """What lies behind a frame on the way back, leading axis (tracks,)."""
+
+    trail: Trail
+    parent: Int[Array, "tracks K"]
+    obs: Observation  # one for all tracks
+
+    @staticmethod
+    def nothing(navigator: Navigator, tracks: int, obs: Observation) -> "Behind":
+        """The end of a recording.
+
+        Args:
+            obs: any of its observations.
+        """
+        bank = navigator.motion.init(navigator.selector.hypotheses)
+        one = Behind(Trail.begin(bank, jnp.asarray(False)), bank.parent, obs)
+
+        def wide(leaf: Array) -> Array:
+            return jnp.broadcast_to(leaf, (tracks, *leaf.shape))
+
+        return dataclasses.replace(
+            one, trail=jax.tree.map(wide, one.trail), parent=wide(one.parent)
+        )
+
+
+class Localised(eqx.Module):
+    """The localised frames of a recording, leading axes (F, tracks) or none."""
+
+    T_world_vehicle: jaxlie.SE3
+    covariance: Float[Array, "... 6 6"]  # of xi in T_world_vehicle * cay(xi)
+    located: Bool[Array, "..."]
+    decided: Bool[Array, "..."]
+    flip_probability: Float[Array, "..."]
+    candidates: Candidates
+    selected: Int[Array, "..."]  # of the candidates; -1: none
+
+    @staticmethod
+    def of(estimate: Estimate) -> "Localised":
+        """What a filter has said of one frame."""
+        same = {f.name: getattr(estimate, f.name) for f in dataclasses.fields(Localised)}
+        same["covariance"] = estimate.covariance[:6, :6]
+        return Localised(**same)
+
+
+@jax.jit
+def smooth_frames(
+    navigator: Navigator, behind: Behind, kept: Kept, obs: Observation
+) -> tuple[Behind, Localised]:
+    """Go back through frames, from the last to the first.
+
+    Args:
+        navigator: the one that filtered them.
+        behind: of the last frame.
+        kept: (F, tracks) frames.
+        obs: F observations, of which `dt_s` and the odometry are used.
+    """
+
+    def one(trail: Trail, parent: Array, kept: Kept, later: Observation) -> tuple[Trail, Localised]:
+        belief = kept.belief
+        trail = trail.back(navigator.motion, belief.bank, belief.decided, parent, later)
+        return trail, _report(navigator, trail, kept)
+
+    def back(behind: Behind, frame: tuple[Kept, Observation]) -> tuple[Behind, Localised]:
+        kept, obs = frame
+        trail, smoothed = jax.vmap(
+            lambda trail, parent, kept: one(trail, parent, kept, behind.obs)
+        )(behind.trail, behind.parent, kept)
+        return Behind(trail, kept.belief.bank.parent, obs), smoothed
+
+    smoothed: tuple[Behind, Localised] = jax.lax.scan(back, behind, (kept, obs), reverse=True)
+    return smoothed
+
+
+def _report(navigator: Navigator, trail: Trail, kept: Kept) -> Localised:
+    """What is reported of one frame of one track."""
+    motion, belief, selector = navigator.motion, kept.belief, navigator.selector
+    bank: Bank = trail.as_bank(belief.bank)
+    best = heaviest(bank)
+    T = motion.T_world_vehicle(bank.mean[best])
+    flip_probability, decided = belief.flip_probability, trail.decided
+    if isinstance(selector, MultiHypothesis):
+        flip_probability = doubt(motion, bank, selector.far_rad)
+        decided = bank.initialised[best] & (flip_probability < selector.decided_mass)
+    candidates = kept.candidates
+    off_rad = jax.vmap(lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T))(
+        candidates.T_vehicle_world
+    )
+    nearest = first_highest(-jnp.where(candidates.valid, off_rad, jnp.inf), EVEN_RAD)
+    return Localised(
+        T_world_vehicle=T,
+        covariance=motion.error_covariance(bank, best)[:6, :6],
+        located=bank.initialised[best],
+        decided=decided,
+        flip_probability=flip_probability,
+        candidates=candidates,
+        selected=jnp.where(jnp.any(candidates.valid) & bank.initialised[best], nearest, -1),
+    )

@@ -1,0 +1,356 @@
+"""Lenses from corners: true within their sigmas, robust to bad data, refused if undetermined."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxnav.calibrate.lens import start as lens_start
+from jaxnav.calibrate.lens.board_shape import check_board
+from jaxnav.calibrate.lens.checks import rim_sigma_px
+from jaxnav.calibrate.lens.choice import informative
+from jaxnav.calibrate.lens.fit import fit_lens
+from jaxnav.calibrate.lens.intrinsics import calibrate_lens
+from jaxnav.calibrate.lens.simulated_views import grid_points_m, seen_from, simulated_views
+from jaxnav.calibrate.lens.views import screened
+from jaxnav.core.models.camera import Camera
+from jaxnav.errors import BadInput
+
+SIZE_PX, SIGMA_PX = (820, 410), 0.1
+POINTS_M = grid_points_m(6, 5, 0.04)
+TRUTHS = {
+    "none": (600.0, 600.0, 411.0, 212.0),
+    "radtan": (619.0, 620.0, 411.0, 212.0, -0.25, 0.08, 1e-3, -5e-4, 0.01),
+    "equidistant": (319.0, 320.0, 401.0, 202.0, 0.01, -5e-3, 2e-3, -4e-4),
+    "omni": (600.0, 602.0, 401.0, 202.0, 0.9, -0.05, 0.01, 1e-3, -5e-4),
+    "double_sphere": (280.0, 281.0, 401.0, 202.0, -0.12, 0.58),
+    "eucm": (319.0, 320.0, 401.0, 202.0, 0.62, 1.1),
+}
+WIDE = ("equidistant", "omni", "double_sphere", "eucm")
+
+
+def views_of(lens, seed=0, count=16, points_m=POINTS_M, **how):
+    truth = TRUTHS[lens]
+    camera = Camera.create(truth[:2], truth[2:4], lens, truth[4:])
+    how = {"distances_m": (0.15, 0.5) if lens in WIDE else (0.25, 0.8)} | how
+    rng = np.random.default_rng(seed)
+    return simulated_views(camera, SIZE_PX, points_m, count, rng, SIGMA_PX, **how)
+
+
+def with_views(views, **changed):
+    """Some views in place of others: v3=..."""
+    all_views = list(views.views)
+    for key, view in changed.items():
+        all_views[int(key[1:])] = view
+    return replace(views, views=tuple(all_views))
+
+
+def test_errors_are_as_large_as_their_sigmas() -> None:
+    truth = np.array(TRUTHS["equidistant"])
+    ratios, squared, noise = [], [], []
+    for seed in range(20):
+        rough = np.array([330.0, 330.0, 409.5, 204.5, *[0.0] * 5])
+        fit = fit_lens(views_of("equidistant", seed)[0], "equidistant", start=rough)
+        error = fit.parameters[:8] - truth
+        ratios.append(error / fit.sigma[:8])
+        squared.append(error @ np.linalg.solve(fit.covariance[:8, :8], error))
+        noise.append(fit.sigma_px)
+        assert np.all(fit.view_weights == 1)
+    assert np.mean(np.abs(ratios) < 3) >= 0.98
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], 8 * 20) / 20
+    assert low < np.mean(squared) < high
+    assert np.mean(noise) == pytest.approx(SIGMA_PX, rel=0.02)
+
+
+@pytest.mark.parametrize("lens", ["radtan", "equidistant"])
+def test_rms_is_not_above_opencvs(lens) -> None:
+    views, _ = views_of(lens, seed=5)
+    points = [POINTS_M[view.ids].astype(np.float32) for view in views.views]
+    corners = [view.corners_px.astype(np.float32) for view in views.views]
+    if lens == "radtan":
+        theirs, *_ = cv2.calibrateCamera(points, corners, SIZE_PX, None, None)
+    else:
+        theirs, *_ = cv2.fisheye.calibrate(
+            [p.reshape(1, -1, 3) for p in points],
+            [c.reshape(1, -1, 2) for c in corners],
+            SIZE_PX,
+            np.eye(3),
+            np.zeros(4),
+            flags=lens_start._fisheye_flag("CALIB_RECOMPUTE_EXTRINSIC")
+            | lens_start._fisheye_flag("CALIB_FIX_SKEW"),
+        )
+    fit = fit_lens(views, lens)
+    assert fit.used.sum() == sum(len(p) for p in points)
+    assert fit.rms_px <= theirs * (1 + 1e-5)
+
+
+def test_wrong_views_are_named_and_pull_at_nothing() -> None:
+    rng = np.random.default_rng(1)
+    views, poses = views_of("equidistant", seed=2)
+    blurred, mixed, some = views.views[3], views.views[7], views.views[9]
+    camera = Camera.create(
+        TRUTHS["equidistant"][:2], TRUTHS["equidistant"][2:4], "equidistant",
+        TRUTHS["equidistant"][4:],
+    )  # fmt: skip
+    longer, inside = seen_from(camera, SIZE_PX, POINTS_M * [1.15, 1, 1], poses[12])
+    ids = np.flatnonzero(inside)
+    noise_px = rng.normal(scale=1.5, size=blurred.corners_px.shape)
+    stray_px = some.corners_px.copy()
+    stray_px[:2] += 12
+    spoilt = with_views(
+        views,
+        v3=replace(blurred, corners_px=blurred.corners_px + noise_px),
+        v7=replace(mixed, corners_px=rng.permutation(mixed.corners_px)),
+        v9=replace(some, corners_px=stray_px),
+        v12=replace(views.views[12], ids=ids, corners_px=longer[ids]),
+    )
+    found = calibrate_lens(spoilt, "equidistant")
+    assert set(found.left_out) == {"view 3", "view 7", "view 12"}
+    assert found.fit.used[9].sum() == len(some.ids) - 2
+    error = found.fit.parameters[:8] - np.array(TRUTHS["equidistant"])
+    assert np.all(np.abs(error) < 4 * found.fit.sigma[:8])
+    assert found.fit.sigma_px == pytest.approx(SIGMA_PX, rel=0.1)
+
+
+@pytest.mark.parametrize("lens", ["none", "radtan", "equidistant"])
+def test_the_lens_is_told_by_views_it_was_not_fitted_to(lens) -> None:
+    found = calibrate_lens(views_of(lens, seed=4)[0])
+    assert found.fit.lens == lens
+    assert not found.fit.fixed
+    assert found.held_out_px[lens] == pytest.approx(SIGMA_PX, rel=0.15)
+
+
+@pytest.mark.parametrize("lens", WIDE[1:])
+def test_a_wide_lens_of_another_kind_is_fitted_where_it_is_asked_for(lens) -> None:
+    """From no start, to within its sigmas; nothing keeps it from the true values."""
+    truth = np.array(TRUTHS[lens])
+    fit = fit_lens(views_of(lens, seed=1)[0], lens)
+    known = len(truth)
+    assert fit.converged
+    assert np.all(fit.view_weights == 1)
+    assert fit.sigma_px == pytest.approx(SIGMA_PX, rel=0.1)
+    error = fit.parameters[:known] - truth
+    assert np.all(np.abs(error) < 4 * fit.sigma[:known])
+    # The focal length on the axis is known, whatever xi makes up for in the figure of the file.
+    camera = Camera.create(truth[:2].tolist(), truth[2:4].tolist(), lens, truth[4:].tolist())
+    on_axis = np.asarray(fit.camera.axis_px) / np.asarray(camera.axis_px)
+    assert np.all(np.abs(on_axis - 1) < 4 * fit.focal_sigma)
+    assert np.all(fit.focal_sigma < 0.002)
+    assert np.isfinite(rim_sigma_px(fit))
+    assert rim_sigma_px(fit) < 0.5
+
+
+def test_a_lens_that_does_not_fit_is_said_to() -> None:
+    with pytest.raises(BadInput, match=r"lens none misses .* calibrate with --lens equidistant"):
+        calibrate_lens(views_of("equidistant", seed=4)[0], "none")
+    found = calibrate_lens(views_of("radtan", seed=4)[0], "none")
+    assert found.fit.lens == "none"
+    assert any("--lens radtan" in sentence for sentence in found.findings)
+
+
+def test_what_corners_do_not_reach_is_held_and_named() -> None:
+    views, _ = views_of("equidistant", seed=6, reach=0.35, distances_m=(0.4, 0.8))
+    found = calibrate_lens(views, "equidistant")
+    assert {"k3", "k4"} <= set(found.fit.fixed)
+    assert "k4" in found.findings[0]
+    assert "held at zero" in found.findings[0]
+    assert np.all(found.fit.parameters[6:8] == 0)
+    assert any("hold the board where" in sentence for sentence in found.advice)
+    error = found.fit.parameters[:2] - TRUTHS["equidistant"][:2]
+    assert np.all(np.abs(error) < 4 * found.fit.sigma[:2])
+
+
+def test_a_held_coefficient_makes_no_other_better_known() -> None:
+    views, _ = views_of("radtan", seed=0, reach=0.5, distances_m=(0.6, 1.2))
+    free, found = fit_lens(views, "radtan"), calibrate_lens(views, "radtan")
+    assert "k3" in found.fit.fixed
+    np.testing.assert_allclose(found.fit.sigma, free.sigma, rtol=1e-6)
+    error = found.fit.parameters[:4] - TRUTHS["radtan"][:4]
+    assert np.all(np.abs(error) < 4 * found.fit.sigma[:4])
+
+
+def test_a_coefficient_that_is_known_is_not_held() -> None:
+    """A webcam's lens, whose border no view shows: its k3 is 9 sigmas, its border 2 px unsure."""
+    truth = (680.0, 680.0, 312.0, 222.0, 0.15, -1.19, 0.0, 0.0, 2.2)
+    camera = Camera.create(truth[:2], truth[2:4], "radtan", truth[4:])
+    rng = np.random.default_rng(3)
+    views, _ = simulated_views(
+        camera, (640, 480), POINTS_M, 17, rng, SIGMA_PX, distances_m=(0.35, 0.6), reach=0.75
+    )
+    found = calibrate_lens(views)
+    assert found.fit.lens == "radtan"
+    assert not {"k1", "k2", "k3"} & set(found.fit.fixed)
+    assert np.all(np.abs(found.fit.parameters[:2] - 680) < 4 * found.fit.sigma[:2])
+
+
+def test_a_coefficient_worth_its_noise_is_not_held() -> None:
+    """At 2.1 sigmas unseen views are better with it, though 3 are needed to be sure of it."""
+    found = calibrate_lens(views_of("radtan", 6, reach=0.5, distances_m=(0.6, 1.2))[0], "radtan")
+    assert not found.fit.fixed
+    assert 1.5 < abs(found.fit.parameters[8]) / found.fit.sigma[8] < 3
+
+
+def test_a_view_a_little_worse_counts_less_only_where_the_lens_is_another_by_it() -> None:
+    views, poses = views_of("radtan", 20)
+    truth, row = TRUTHS["radtan"], views.views[3]
+    noise_px = np.random.default_rng(20).normal(scale=3.2 * SIGMA_PX, size=row.corners_px.shape)
+    noisy = with_views(views, v3=replace(row, corners_px=row.corners_px + noise_px))
+    fit = fit_lens(noisy, "radtan")
+    matrix, _ = lens_start.opencv_calibration(noisy, noisy.views, "radtan")
+    assert np.all(fit.view_weights == 1)
+    np.testing.assert_allclose(fit.parameters[:2], [matrix[0, 0], matrix[1, 1]], rtol=1e-6)
+
+    camera = Camera.create(truth[:2], truth[2:4], "radtan", truth[4:])
+    longer, inside = seen_from(camera, SIZE_PX, POINTS_M * [1.012, 1, 1], poses[3])
+    ids = np.flatnonzero(inside)
+    fit = fit_lens(with_views(views, v3=replace(row, ids=ids, corners_px=longer[ids])), "radtan")
+    assert 0 < fit.view_weights[3] < 0.5
+    assert np.all(np.abs(fit.parameters[:2] - truth[:2]) < 3 * fit.sigma[:2])
+
+
+def test_a_lens_that_most_programs_read_is_taken_where_it_does() -> None:
+    truth = (900.0, 900.0, 411.0, 212.0, 0.01, -5e-3, 2e-3, -4e-4)
+    camera = Camera.create(truth[:2], truth[2:4], "equidistant", truth[4:])
+    rng = np.random.default_rng(5)
+    views, _ = simulated_views(camera, SIZE_PX, POINTS_M, 16, rng, SIGMA_PX, distances_m=(0.4, 1.2))
+    assert calibrate_lens(views).fit.lens == "radtan"
+
+
+def bent(views, rng, scale_px=0.3):
+    """The views of a board that bends anew in each: corners shift by a smooth field."""
+
+    def one(view):
+        at = POINTS_M[view.ids, :2] / np.ptp(POINTS_M[:, :2], axis=0).max() * 2
+        field = np.column_stack([at**2, at[:, :1] * at[:, 1:], at**3]) @ rng.normal(size=(5, 2))
+        return replace(view, corners_px=view.corners_px + scale_px * field)
+
+    return replace(views, views=tuple(map(one, views.views)))
+
+
+def test_views_that_disagree_grow_the_sigmas() -> None:
+    rough = np.array([330.0, 330.0, 409.5, 204.5, *[0.0] * 5])
+    apart, white = [], []
+    for seed in range(8):
+        views = views_of("equidistant", seed, count=32)[0]
+        white.append(fit_lens(views, "equidistant", start=rough).inflation)
+        views = bent(views, np.random.default_rng(seed))
+        halves = [
+            fit_lens(replace(views, views=views.views[part]), "equidistant", start=rough)
+            for part in (slice(0, None, 2), slice(1, None, 2))
+        ]
+        assert min(half.inflation for half in halves) > 2
+        difference = halves[0].parameters[:8] - halves[1].parameters[:8]
+        apart.append(difference / np.hypot(halves[0].sigma[:8], halves[1].sigma[:8]))
+    assert np.sum(np.array(white) == 1) >= 7
+    assert np.mean(np.abs(apart) < 3) > 0.98
+    assert 0.7 < np.sqrt(np.mean(np.square(apart))) < 1.5
+
+
+def parallel():
+    return views_of("none", seed=1, most_tilt_deg=0)[0]
+
+
+def few():
+    return views_of("none", count=4)[0]
+
+
+def copies():
+    views, _ = views_of("none", count=4)
+    again = tuple(replace(view, name=f"copy of {view.name}") for view in views.views)
+    return replace(views, views=views.views + again)
+
+
+def other_board():
+    views, _ = views_of("none")
+    return replace(views, points_board_m=grid_points_m(5, 6, 0.04))
+
+
+@pytest.mark.parametrize(
+    ("make", "line"),
+    [
+        (parallel, r"tilt .* by 30 to 45 deg"),
+        (few, r"4 different, sharp views of the board are too few: take at least 5"),
+        (copies, r"too few.*left out: copy of view 0 \(the same picture as view 0\), and 3 more"),
+        (other_board, r"is it the board of the file"),
+    ],
+)
+@pytest.mark.parametrize("lens", ["none", "equidistant"])
+def test_what_views_can_not_tell_is_refused_in_one_line(make, line, lens) -> None:
+    with pytest.raises(BadInput, match=rf"^shots: .*{line}") as error:
+        calibrate_lens(make(), lens, where="shots")
+    assert "\n" not in str(error.value)
+
+
+def test_a_board_that_is_not_square_is_named() -> None:
+    views, _ = views_of("equidistant", seed=8, points_m=POINTS_M * [1.005, 1, 1])
+    fit = fit_lens(replace(views, points_board_m=POINTS_M), "equidistant")
+    board = check_board(fit)
+    assert board.stretch == pytest.approx(1 / 1.005 - 1, abs=4 * board.stretch_sigma)
+    assert abs(board.stretch) > 5 * board.stretch_sigma
+    true_board = check_board(fit_lens(views_of("equidistant", seed=8)[0], "equidistant"))
+    assert abs(true_board.stretch) < 4 * true_board.stretch_sigma
+    assert true_board.p_value > 1e-3
+
+
+def test_points_of_the_board_that_lie_elsewhere_are_named() -> None:
+    moved = POINTS_M + np.where(np.arange(len(POINTS_M)) % 2, 5e-4, -5e-4)[:, None] * [1, 0, 0]
+    views, _ = views_of("equidistant", seed=9, points_m=moved)
+    found = calibrate_lens(replace(views, points_board_m=POINTS_M), "equidistant")
+    assert any("from where its file says" in sentence for sentence in found.findings)
+
+
+def test_a_row_that_nobody_saw_is_named() -> None:
+    views, _ = views_of("none", seed=7, points_m=POINTS_M[:-6])
+    found = calibrate_lens(replace(views, points_board_m=POINTS_M), "none")
+    assert found.findings == (
+        "no view shows the bottom row of the board's points: are there as many rows and columns "
+        "as its file says?",
+    )
+
+
+def test_the_views_that_are_chosen_tell_more() -> None:
+    views, _ = views_of("equidistant", seed=10, count=48)
+    truth = np.append(TRUTHS["equidistant"], 0.0)
+    chosen = informative(views, "equidistant", truth, 16)
+    assert len(chosen) == len(set(chosen)) == 16
+
+    def spread(numbers):
+        some = replace(views, views=tuple(views.views[i] for i in numbers))
+        return np.linalg.slogdet(fit_lens(some, "equidistant").covariance[:8, :8])[1]
+
+    assert spread(chosen) < spread(range(0, 48, 3)) - 1
+
+
+def test_a_single_marker_will_do() -> None:
+    square_m = 0.086 * np.array([[-1.0, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    views, _ = views_of("equidistant", seed=12, count=32, points_m=square_m, fewest=4)
+    fit = fit_lens(views, "equidistant")
+    assert np.all(fit.view_weights == 1)
+    error = fit.parameters[:8] - np.array(TRUTHS["equidistant"])
+    assert np.all(np.abs(error) < 4 * fit.sigma[:8])
+    assert np.all(fit.sigma[:2] < 0.005 * 319)
+
+
+def test_opencv_is_not_needed(monkeypatch) -> None:
+    def throws(*_):
+        raise cv2.error("ill-conditioned")
+
+    views, _ = views_of("equidistant", seed=11)
+    expected = fit_lens(views, "equidistant")
+    monkeypatch.setattr(lens_start, "opencv_calibration", throws)
+    # Steps end where they promise a cost of 1e-12 of the sum, here 1e-4 of a standard deviation.
+    away = fit_lens(views, "equidistant").parameters - expected.parameters
+    assert np.max(np.abs(away) - 1e-4 * expected.sigma) <= 0
+
+
+def test_blurred_and_empty_views_are_screened() -> None:
+    views, _ = views_of("none", count=6)
+    sharp = [replace(view, edge_width_px=2.0) for view in views.views]
+    sharp[1] = replace(sharp[1], edge_width_px=7.0)
+    sharp[2] = replace(sharp[2], ids=sharp[2].ids[:3], corners_px=sharp[2].corners_px[:3])
+    kept, left_out = screened(replace(views, views=tuple(sharp)))
+    assert len(kept.views) == 4
+    assert "blurred" in left_out["view 1"]
+    assert "only 3 points" in left_out["view 2"]

@@ -1,0 +1,525 @@
+"""Errors of sensors and cameras as states: against dense least squares and textbook filters."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jaxnav.core.filter.ambiguity import PoseMeasurement, PosePosterior
+from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.camera_errors import EACH, ErrorsPosterior, common_turn, not_told
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.follow_pose import follow_pose
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.filter.map_fit import fit_poses
+from jaxnav.core.filter.sensor_errors import SENSORS_END, SIX, SLIP
+from jaxnav.core.models.geometry import ON_GROUND, T_world_vehicle_from_planar, cayley
+from jaxnav.core.models.rig import PLACED_BY_HAND
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.pose.linearised import reprojection_rows
+from jaxnav.core.pose.nuisance import camera_slopes
+from jaxnav.core.pose.observation import Observation, Snapshot
+from tests import worlds
+
+SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
+SLIP_SIGMA = 0.05
+VIEW = worlds.OVERLAP_VIEW  # two cameras see the marker
+PLANAR = jnp.asarray(ON_GROUND, float)
+NOTHING = Observation(jnp.zeros((4, 1, 4, 2)), jnp.zeros((4, 1), bool))
+
+
+def off_rig():
+    rig = worlds.qcar_rig()
+    return dataclasses.replace(rig, extrinsics_sigma=jnp.tile(jnp.asarray(PLACED_BY_HAND), (4, 1)))
+
+
+def off_car():
+    return dataclasses.replace(worlds.qcar(), sensor_sigma=jnp.asarray(SIGMA))
+
+
+def spd(n: int, rng: np.random.Generator, scale: np.ndarray) -> np.ndarray:
+    A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
+    return scale[:, None] * (A @ A.T) * scale[None]
+
+
+@pytest.fixture(scope="module")
+def navigator() -> Navigator:
+    return Navigator(off_rig(), worlds.paper_markers(), off_car(), selector=MultiHypothesis())
+
+
+def bank_at(navigator: Navigator, rng: np.random.Generator):
+    """A single hypothesis at VIEW, all of its states correlated."""
+    bank = navigator.motion.init(1)
+    n = bank.mean.shape[1]
+    scale = np.concatenate(
+        [[0.03, 0.03, 0.03], [0.1] * 3, [SLIP_SIGMA], SIGMA, np.ones(n - SENSORS_END)]
+    )
+    mean = np.zeros(n)
+    mean[:3] = VIEW + 0.01 * rng.normal(size=3)
+    mean[3:SIX] = 0.3, -0.1, 0.2
+    mean[SIX:] = 0.3 * scale[SIX:] * rng.normal(size=n - SIX)
+    return eqx.tree_at(
+        lambda b: (b.mean, b.covariance, b.initialised, b.log_weight),
+        bank,
+        (
+            jnp.asarray(mean[None]),
+            jnp.asarray(spd(n, rng, scale)[None]),
+            jnp.ones(1, bool),
+            jnp.zeros(1),
+        ),
+    )
+
+
+def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
+    """Pose, turns, places and the vehicle's tilt as the unknowns of one problem, by SciPy."""
+    rng = np.random.default_rng(5)
+    noise_px = rng.normal(size=(4, 1, 4, 2))
+    obs = worlds.observe(
+        off_rig(), worlds.paper_markers(), worlds.planar(*VIEW), jnp.asarray(noise_px)
+    )
+    snapshot = jax.jit(Snapshot.create)(off_rig(), worlds.paper_markers(), obs, 1.0)
+    assert int(jnp.sum(snapshot.seen.visible)) == 2
+    bank = bank_at(navigator, rng)
+    prior = eqx.filter_jit(navigator.motion.poses)(bank)
+    fit = jax.jit(fit_poses, static_argnums=6)(
+        prior.T_world_vehicle, prior.covariance, prior.errors, prior, snapshot, jnp.zeros(6), 60
+    )
+
+    moves = jax.jit(camera_slopes)(snapshot.rig, snapshot.markers, snapshot.seen)
+    corners = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
+    T_prior = jaxlie.SE3(prior.T_world_vehicle.wxyz_xyz[0])
+    e = prior.errors.mean.shape[1]
+    H = np.zeros((3 + e, bank.mean.shape[1]))
+    H[3:, SENSORS_END:] = np.eye(e)
+    P = np.block(
+        [
+            [PLANAR.T @ prior.covariance[0] @ PLANAR, PLANAR.T @ prior.errors.cross[0]],
+            [(PLANAR.T @ prior.errors.cross[0]).T, prior.errors.covariance[0]],
+        ]
+    )
+    root = np.linalg.cholesky(P)
+    turns = np.zeros((e, moves.turns.shape[1]))
+    for group, camera in enumerate(np.asarray(moves.camera)):
+        turns[EACH * camera : EACH * (camera + 1)] += np.asarray(moves.turns[:, :, group])
+    places = np.asarray(moves.places).transpose(2, 0, 1).reshape(-1, turns.shape[1])
+
+    # The vehicle's nuisance, as the estimator linearises it: at the prediction.
+    @jax.jit
+    def at(xi):
+        rows = reprojection_rows(snapshot.rig, snapshot.seen)
+        return rows(moved(T_prior @ cayley(xi), corners))[0].reshape(-1)
+
+    tilt = jax.jit(jax.jacobian(lambda t: at(prior.nuisance @ t)))(
+        jnp.zeros(prior.nuisance.shape[1])
+    )
+
+    def residuals(x):
+        y, b, t = np.split(x, [3 + e, 3 + e + len(places)])
+        xi, q = np.split(root @ y, [3])
+        q = q + np.asarray(prior.errors.mean[0])
+        r = np.asarray(at(ON_GROUND @ xi)) + q @ turns + b @ places + np.asarray(tilt) @ t
+        return np.concatenate([r, x])
+
+    found = least_squares(residuals, np.zeros(3 + e + len(places) + 3), method="lm", xtol=1e-14)
+    y = root @ found.x[: 3 + e]
+    C = root @ np.linalg.inv(found.jac.T @ found.jac)[: 3 + e, : 3 + e] @ root.T
+    T_expected = T_prior @ cayley(PLANAR @ jnp.asarray(y[:3]))
+    T = jaxlie.SE3(fit.posterior.T_world_vehicle.wxyz_xyz[0])
+    np.testing.assert_allclose((T.inverse() @ T_expected).log(), 0, atol=2e-6)
+    seen = np.asarray(fit.posterior.errors.rows[0]).sum(0) > 0
+    assert seen.sum() == 2 * EACH
+    q = np.asarray(fit.posterior.errors.rows[0]).T @ np.asarray(fit.posterior.errors.change[0])
+    np.testing.assert_allclose(q[seen], y[3:][seen], atol=1e-4)
+
+    # The rest of the state, by the joint Gaussian of all of it.
+    posterior = jax.tree.map(lambda leaf: leaf[0], fit.posterior)
+    offer = eqx.filter_jit(navigator.motion.follow)(
+        jax.tree.map(lambda leaf: leaf[0], bank), posterior, obs
+    )
+    mean, covariance = map(np.asarray, offer.posterior)
+    np.testing.assert_allclose(mean[SENSORS_END:] - bank.mean[0, SENSORS_END:], y[3:], atol=1e-4)
+    np.testing.assert_allclose(covariance[SENSORS_END:, SENSORS_END:], C[3:, 3:], atol=2e-3)
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+@pytest.mark.parametrize("body", ["car", pytest.param("free", marks=pytest.mark.long)])
+def test_a_start_far_from_its_guess_keeps_a_covariance(navigator, body):
+    """Hypotheses of the fan turn by degrees onto the corners, and 3 m away a degree is 5 cm: the
+    turns of the cameras go with the corrected pose, not with the guess."""
+    if body == "free":
+        navigator = Navigator(off_rig(), worlds.paper_markers(), selector=MultiHypothesis())
+    rng = np.random.default_rng(0)
+    noise_px = rng.normal(size=(4, 1, 4, 2))
+    obs = worlds.observe(
+        off_rig(), worlds.paper_markers(), worlds.planar(0.0, -1.7, 1.7), jnp.asarray(noise_px)
+    )
+    bank = jax.jit(navigator.sense)(navigator.believe(navigator.motion.init(24)), obs)[0].bank
+    alive = np.asarray(bank.initialised)
+    assert alive.sum() > 5
+    P = np.asarray(bank.covariance)[alive]
+    states = navigator.motion.states
+    known = np.r_[0 : states // 2, P.shape[1] - 4 * EACH : P.shape[1]]
+    P = P[:, known][:, :, known]
+    sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+    least = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None])[:, 0]
+    assert np.all(least > 0)
+
+
+follow = jax.jit(follow_pose, static_argnums=4)
+
+
+def moved(T_world_vehicle: jaxlie.SE3, corners):
+    return jax.vmap(T_world_vehicle.inverse().apply)(corners).T[..., None]
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(hidden):
+    """The textbook's joint update by a measurement of pose and errors, of which some are unseen."""
+    rng = np.random.default_rng(7)
+    n, d, e = 12, 3, 4
+    P = spd(n, rng, np.full(n, 0.01))
+    rows = np.eye(e)[:2]
+    if hidden:
+        rows = np.vstack([rows, np.zeros((1, e))])
+    H = np.zeros((d + 2, n))
+    H[:d, :d] = np.eye(d)
+    H[d:, n - e :] = np.eye(e)[:2]
+    R = spd(d + 2, rng, np.full(d + 2, 0.01))
+    z = 0.003 * rng.normal(size=d + 2)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    expected, P_expected = K @ z, P - K @ H @ P
+    y, C = H @ expected, H @ P_expected @ H.T
+    slope = C[d:, :d] @ np.linalg.inv(C[:d, :d])
+    given = C[d:, d:] - slope @ C[:d, d:]
+    if hidden:
+        y, slope = np.append(y, 0), np.vstack([slope, np.zeros((1, d))])
+        given = np.block([[given, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+    T_prior = worlds.planar(0.3, -0.2, 0.7)
+    xi = PLANAR @ jnp.asarray(y[:d])
+    corrected = PosePosterior(
+        T_prior @ cayley(xi),
+        PLANAR @ jnp.asarray(C[:d, :d]) @ PLANAR.T,
+        jnp.zeros(d),
+        jnp.ones(()),
+        jnp.zeros(()),
+        jnp.asarray(True),
+        ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows))),
+    )
+    correction, after = follow(jnp.asarray(P), T_prior, corrected, PLANAR, n - e)
+    np.testing.assert_allclose(correction[:d], y[:d], atol=1e-8)
+    np.testing.assert_allclose(correction, expected, atol=2e-5)
+    np.testing.assert_allclose(after, P_expected, atol=3e-6)
+
+
+def test_what_is_considered_keeps_mean_and_covariance(navigator):
+    """Schmidt's filter: pose and velocity and their correlations as in the optimal one."""
+    motion, rng = navigator.motion, np.random.default_rng(2)
+    before = bank_at(navigator, rng)
+    x, P = before.mean[0], before.covariance[0]
+    after = x + 0.1, P / 2
+    mean, covariance = motion.considered(jnp.asarray(False), (x, P), after)
+    np.testing.assert_array_equal(mean[SIX:], x[SIX:])
+    np.testing.assert_array_equal(covariance[SIX:, SIX:], P[SIX:, SIX:])
+    np.testing.assert_array_equal(mean[:SIX], after[0][:SIX])
+    np.testing.assert_array_equal(covariance[:SIX], after[1][:SIX])
+    learnt = motion.considered(jnp.asarray(True), (x, P), after)
+    for one, other in zip(learnt, after, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("inflation", [1.0, 3.0, 10.0])
+def test_a_pose_that_is_inflated_keeps_errors_that_are_considered_in_proportion(
+    navigator, inflation
+):
+    """Whatever the prior: with its errors at their prior again the covariance is still one."""
+    motion, rng = navigator.motion, np.random.default_rng(5)
+    bank = bank_at(navigator, rng)
+    x, n, states, d = bank.mean[0], bank.covariance.shape[1], motion.states, 3
+    # As correlated as they are after a while: pose, velocity and errors vary as one, nearly.
+    alike = rng.normal(size=(n, d))
+    P = 0.01**2 * (alike @ alike.T + 0.05 * np.eye(n))
+    freedom, C = PLANAR, P[:d, :d] / 2
+    corrected = PosePosterior(
+        worlds.planar(0.3, -0.2, 0.7),
+        freedom @ jnp.asarray(inflation * C) @ freedom.T,
+        jnp.zeros(d),
+        jnp.asarray(inflation),
+        jnp.zeros(()),
+        jnp.asarray(True),
+    )
+    _, after = follow(jnp.asarray(P), worlds.planar(0.3, -0.2, 0.7), corrected, freedom, states)
+    np.testing.assert_allclose(after[:d, :d], inflation * C, rtol=1e-7, atol=1e-12)
+    posterior = jnp.zeros_like(x), after
+    _, considered = motion.considered(jnp.asarray(False), (x, jnp.asarray(P)), posterior)
+    sigma = np.sqrt(np.diagonal(considered))
+    assert np.linalg.eigvalsh(considered / np.outer(sigma, sigma)).min() > -1e-9
+    np.testing.assert_array_equal(considered[states:, states:], P[states:, states:])
+
+
+def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator):
+    motion = navigator.motion
+    bank = motion.init(2)
+    P = bank.covariance.at[:, 2, 2].set(0.01**2)
+    bank = eqx.tree_at(
+        lambda b: (b.covariance, b.initialised, b.log_weight),
+        bank,
+        (P, jnp.ones(2, bool), jnp.log(jnp.asarray([0.9, 0.1]))),
+    )
+    assert bool(motion.learns(bank))
+    mirrored = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[1, 2].set(1.0))
+    assert not bool(motion.learns(mirrored))
+    obs = worlds.observe(off_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    obs = dataclasses.replace(
+        obs, speed_mps=jnp.asarray(0.5), steering_rad=jnp.asarray(0.3), dt_s=jnp.asarray(0.1)
+    )
+    predict = eqx.filter_jit(motion.predict)
+    later = predict(predict(bank, obs), obs)
+    np.testing.assert_array_equal(later.mean[:, SIX:], 0)
+    errors = bank.covariance[:, SIX:, SIX:]
+    np.testing.assert_allclose(later.covariance[:, SIX:, SIX:], errors, rtol=1e-12)
+
+
+def test_a_slip_fades_with_the_way_and_another_comes(navigator):
+    """A Gauss-Markov process: the covariance of two slips falls with the way between them."""
+    motion, rng = navigator.motion, np.random.default_rng(3)
+    bank = bank_at(navigator, rng)
+    obs = worlds.observe(off_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    obs = dataclasses.replace(
+        obs, dt_s=jnp.asarray(0.1), has_odometry=jnp.asarray(False), speed_mps=jnp.zeros(())
+    )
+    way_m = 0.1 * float(jnp.linalg.norm(bank.mean[0, 3:5]))
+    f = np.exp(-way_m / motion.slip_length_m)
+    predict = eqx.filter_jit(motion.predict)
+    later = predict(bank, obs)
+    n = bank.mean.shape[1]
+    F = np.eye(n)
+    F[SLIP, SLIP] = f
+    expected = F @ np.asarray(bank.covariance[0]) @ F.T
+    expected[SLIP, SLIP] += (1 - f**2) * SLIP_SIGMA**2
+    np.testing.assert_allclose(later.covariance[0, SIX:, SIX:], expected[SIX:, SIX:], rtol=1e-10)
+    assert 0.5 < f < 0.95
+    assert float(later.mean[0, SLIP]) == pytest.approx(f * float(bank.mean[0, SLIP]))
+    still = motion.init(1)  # at its prior it stays there, whatever the way
+    moving = eqx.tree_at(lambda b: b.mean, still, still.mean.at[:, 3].set(0.5))
+    variance = predict(moving, obs).covariance[0, SLIP, SLIP]
+    assert float(variance) == pytest.approx(SLIP_SIGMA**2)
+
+
+@pytest.mark.parametrize("slip_sigma", [SLIP_SIGMA, 0.0])
+def test_the_pose_follows_where_wheels_spin(slip_sigma):
+    """Straight on at 0.3 m/s; after four seconds the odometer reads a quarter more. Two seconds on
+    the slip is known and the pose has followed; without one the constant scale takes it along."""
+    car = dataclasses.replace(off_car(), sensor_sigma=jnp.asarray([0.03, 0.0, 0.0, 0.0]))
+    motion = BicycleKalman(car, slip_sigma=slip_sigma)
+    bank = eqx.tree_at(lambda b: b.initialised, motion.init(1), jnp.ones(1, bool))
+    P = bank.covariance.at[:, :SIX, :SIX].multiply(0.01**2)
+    bank = eqx.tree_at(lambda b: b.covariance, bank, P)
+    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    sigma_m = 0.01
+    R = PLANAR @ (sigma_m**2 * jnp.eye(3)) @ PLANAR.T
+
+    def frame(bank, time_s):
+        read = 0.3 * jnp.where(time_s < 4, 1, 1.25)
+        told = dataclasses.replace(
+            obs, speed_mps=read, steering_rad=jnp.zeros(()), dt_s=jnp.asarray(1 / 15)
+        )
+        bank = motion.predict(bank, told)
+        there = PoseMeasurement(
+            worlds.planar(0.3 * time_s, 0.0, 0.0), R, jnp.zeros(()), jnp.asarray(True)
+        )
+        offer = motion.measure(jax.tree.map(lambda leaf: leaf[0], bank), there, told)
+        bank = eqx.tree_at(
+            lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
+        )
+        return bank, bank.mean[0]
+
+    times_s = jnp.arange(1, 91) / 15
+    mean = np.asarray(jax.jit(lambda: jax.lax.scan(frame, bank, times_s)[1])())
+    slip, scale = mean[:, SLIP], mean[:, SLIP + 1]
+    behind_m = abs(mean[-1, 0] - 0.3 * times_s[-1])
+    assert max(abs(slip[times_s < 4]).max(), abs(scale[times_s < 4]).max()) < 0.015
+    if slip_sigma:
+        assert slip[-1] < -1.5 * SLIP_SIGMA
+        assert behind_m < 0.01
+    else:
+        assert behind_m > 0.03
+
+
+def steered(rng: np.random.Generator, duration_s: float, by_frame: bool):
+    """Planar poses (N, 3) and steering (N,), rad, each ms at 0.35 m/s.
+
+    A servo of 5 rad/s follows targets that change at random times, or 25 ms after each frame.
+    """
+    times_s = np.arange(0, duration_s, 1e-3)
+    if by_frame:
+        walk = np.zeros(int(duration_s * 15) + 2)
+        for k in range(1, len(walk)):
+            walk[k] = np.clip(0.95 * walk[k - 1] + 0.1 * rng.normal(), -0.45, 0.45)
+        target = walk[np.clip((times_s - FIRST_S - 0.025) * 15, 0, None).astype(int)]
+    else:
+        steps = np.cumsum(rng.uniform(0.3, 1.2, int(duration_s / 0.3)))
+        target = rng.uniform(-0.4, 0.4, len(steps) + 1)[np.searchsorted(steps, times_s)]
+    steering = np.zeros_like(target)
+    for k in range(1, len(target)):
+        steering[k] = steering[k - 1] + np.clip(target[k] - steering[k - 1], -0.005, 0.005)
+    beta = np.arctan(np.tan(steering) / 2)
+    rate = 0.35 * np.cos(beta) * np.tan(steering) / float(worlds.qcar().wheelbase_m)
+    psi = np.cumsum(rate) * 1e-3
+    velocity = 0.35 * np.stack([np.cos(psi + beta), np.sin(psi + beta)], axis=1)
+    return np.column_stack([np.cumsum(velocity, axis=0) * 1e-3, psi]), steering
+
+
+FIRST_S = 0.25  # of the frames, where the poses are zero
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "odometry_hz", "by_frame", "most_z2", "most_off_s"),
+    [
+        (-0.02, 15, False, 2, 0.004),
+        (0.0, 150, False, 2, 0.002),
+        (0.05, 15, False, 2, 0.004),
+        (0.05, 150, False, 2, 0.002),
+        (0.05, 15, True, 2, 0.004),
+    ],
+)
+def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
+    delay_s, odometry_hz, by_frame, most_z2, most_off_s
+):
+    """Poses as they were `delay_s` earlier, from a car that steers between two frames.
+
+    An odometer that is read ten times a frame must not look like a delay of 4 ms, and steps that
+    are not seen yet not like cameras that are 5 ms less late.
+    """
+    cars, period, reads = 16, 1 / 15, odometry_hz // 15
+    motion = BicycleKalman(off_car())
+    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
+    sigma = np.array([0.004, 0.004, 0.004])
+    R = PLANAR @ jnp.diag(jnp.asarray(sigma**2)) @ PLANAR.T
+    start = motion.init(1)
+    P = start.covariance.at[:, :3, :3].multiply(0.03**2).at[:, 3:SIX, 3:SIX].multiply(0.01**2)
+    mean = start.mean.at[0, 3].set(0.35)
+    start = eqx.tree_at(
+        lambda b: (b.initialised, b.mean, b.covariance), start, (jnp.ones(1, bool), mean, P)
+    )
+    rng, frames = np.random.default_rng(8), 450
+    poses, readings = [], []
+    for _ in range(cars):
+        pose, steering = steered(rng, frames * period + 0.5, by_frame)
+        at_ms = 1e3 * FIRST_S + 1e3 * period * np.arange(frames)
+        seen = pose[np.round(at_ms - 1e3 * delay_s).astype(int)] - [*pose[250, :2], 0]
+        poses.append(seen + sigma * rng.normal(size=(frames, 3)))
+        ends = at_ms[:, None] - 1e3 * period * np.arange(reads)[::-1] / reads
+        readings.append(steering[np.round(ends).astype(int)])
+
+    def frame(bank, told):
+        pose, steering = told
+
+        def read(bank, angle):
+            event = dataclasses.replace(
+                obs,
+                speed_mps=jnp.asarray(0.35),
+                steering_rad=angle,
+                dt_s=jnp.asarray(period / reads),
+            )
+            return motion.predict(bank, event), None
+
+        bank, _ = jax.lax.scan(read, bank, steering)
+        there = PoseMeasurement(worlds.planar(*pose), R, jnp.zeros(()), jnp.asarray(True))
+        offer = motion.measure(jax.tree.map(lambda leaf: leaf[0], bank), there, obs)
+        bank = eqx.tree_at(
+            lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
+        )
+        return bank, None
+
+    drive = jax.jit(jax.vmap(lambda told: jax.lax.scan(frame, start, told)[0]))
+    bank = drive((jnp.asarray(np.array(poses)), jnp.asarray(np.array(readings))))
+    tau = np.asarray(bank.mean[:, 0, SENSORS_END - 1])
+    sigma_s = np.sqrt(np.asarray(bank.covariance[:, 0, SENSORS_END - 1, SENSORS_END - 1]))
+    assert np.all(sigma_s < 0.01)
+    z = (tau - delay_s) / sigma_s
+    assert np.mean(z**2) < most_z2, (tau, sigma_s)
+    assert abs(np.mean(tau) - delay_s) < most_off_s, (tau, sigma_s)
+
+
+def test_a_body_that_moves_freely_learns_how_cameras_differ_and_not_how_they_turn_alike():
+    """Two of four cameras in view: what turns both alike turns a body the other way, unseen."""
+    rng, rig = np.random.default_rng(11), off_rig()
+    navigator = Navigator(rig, worlds.paper_markers(), selector=MultiHypothesis())
+    bank, n = navigator.motion.init(1), 12 + 4 * EACH
+    T = T_world_vehicle_from_planar(jnp.asarray(VIEW))
+    before = dataclasses.replace(
+        jax.tree.map(lambda leaf: leaf[0], bank),
+        mean=jnp.zeros(n + 1).at[:7].set(T.wxyz_xyz),
+        covariance=jnp.asarray(spd(n, rng, np.append(np.full(12, 0.05), np.ones(12)))),
+        initialised=jnp.asarray(True),
+    )
+    seen = [0, 2]
+    rows = np.zeros((2 * EACH, 4 * EACH))
+    for slot, camera in enumerate(seen):
+        rows[EACH * slot : EACH * slot + EACH, EACH * camera : EACH * camera + EACH] = np.eye(EACH)
+    errors = ErrorsPosterior(
+        change=jnp.asarray(0.3 * rng.normal(size=2 * EACH)),
+        slope=jnp.asarray(rng.normal(size=(2 * EACH, 6))),
+        covariance=jnp.asarray(spd(2 * EACH, rng, np.full(2 * EACH, 0.2))),
+        rows=jnp.asarray(rows),
+    )
+    measured = PosePosterior(
+        T_world_vehicle=T @ cayley(jnp.asarray(0.01 * rng.normal(size=6))),
+        covariance=jnp.asarray(spd(6, rng, np.full(6, 0.005))),
+        log_likelihood=jnp.asarray(0.0),
+        innovation=jnp.zeros(6),
+        inflation=jnp.asarray(1.0),
+        valid=jnp.asarray(True),
+        errors=errors,
+    )
+    mean, P = jax.jit(ConstantVelocity.follow)(
+        navigator.motion, before, measured, NOTHING
+    ).posterior
+    alike = np.zeros((4, EACH, EACH))
+    alike[seen] = np.eye(EACH) / np.sqrt(2)
+    alike = alike.reshape(4 * EACH, EACH)
+    np.testing.assert_allclose(alike.T @ mean[13:], 0, atol=1e-12)
+    block, prior = P[12:, 12:], before.covariance[12:, 12:]
+    np.testing.assert_allclose(alike.T @ block @ alike, alike.T @ prior @ alike, rtol=1e-12)
+    differ = np.zeros((4, EACH, EACH))
+    differ[seen] = np.eye(EACH)[None] * np.array([1, -1])[:, None, None] / np.sqrt(2)
+    differ = differ.reshape(4 * EACH, EACH)
+    assert np.all(np.abs(differ.T @ mean[13:]) > 1e-3)
+    assert np.all(np.diag(differ.T @ block @ differ) < 0.9 * np.diag(differ.T @ prior @ differ))
+    assert np.linalg.eigvalsh(P)[0] > 0
+
+
+@pytest.mark.parametrize("unseen", [(), (1,), (0, 1)])
+def test_the_turn_of_cameras_alike_counts_in_radians_and_those_in_view(unseen):
+    sigma_rad = jnp.asarray([[0.01, 0.02, 0.005], [0.02, 0.01, 0.005]])
+    rows = np.eye(2 * EACH)
+    for camera in unseen:
+        rows[EACH * camera : EACH * camera + EACH] = 0
+    errors = ErrorsPosterior(jnp.zeros(6), jnp.zeros((6, 6)), jnp.eye(6), jnp.asarray(rows))
+    found = np.asarray(common_turn(errors, sigma_rad)).reshape(2, EACH, EACH)
+    for axis in range(EACH):
+        turns = np.where(np.isin(np.arange(2), unseen), 0, 0.1) / np.asarray(sigma_rad)[:, axis]
+        length = np.linalg.norm(turns)
+        expected = np.zeros((2, EACH))
+        expected[:, axis] = turns / length if length else 0
+        np.testing.assert_allclose(found[:, :, axis], expected, atol=1e-14)
+    # Nothing in view: nothing is kept from being corrected.
+    correction, P = jnp.arange(8.0), jnp.eye(8)
+    kept, wider = not_told(jnp.zeros((6, EACH)), 4 * P, correction, P)
+    np.testing.assert_array_equal(kept, correction)
+    np.testing.assert_array_equal(wider, P)
+
+
+def test_a_rule_has_the_paper_s_six_states():
+    from jaxnav.core.filter.ambiguity import PaperCost
+
+    rule = Navigator(off_rig(), worlds.paper_markers(), off_car(), selector=PaperCost())
+    assert rule.init().belief.bank.mean.shape == (1, 6)
+    exact = Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
+    assert exact.init().belief.bank.mean.shape == (24, 6)
+    assert isinstance(exact.motion, BicycleKalman)

@@ -1,0 +1,785 @@
+"""The filters against textbook NumPy, statistics and simulated motion."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from scipy import stats
+
+from jaxnav.core.filter.ambiguity import PoseMeasurement, Selection
+from jaxnav.core.filter.bank import Bank, restart_broken
+from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.gate import Offer, apply_gate
+from jaxnav.core.filter.motion import Motion
+from jaxnav.core.pose.observation import Observation
+from tests import worlds
+from tests.derivatives import in_float32
+from tests.reference import kalman, paper
+
+WHEELBASE_M = 0.256
+
+
+def chosen(prior: Bank, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selection:
+    """What a selector says that gives one pose to every hypothesis, or none."""
+    count = prior.log_weight.shape[0]
+    return Selection(
+        measured=PoseMeasurement(
+            T_world_vehicle=jaxlie.SE3(jnp.tile(T_world_vehicle.wxyz_xyz, (count, 1))),
+            covariance=jnp.tile(jnp.asarray(covariance, float), (count, 1, 1)),
+            log_misfit=jnp.zeros(count),
+            valid=jnp.full(count, taken),
+        ),
+        kept=prior.initialised,
+        log_weight=prior.log_weight,
+        heir=jnp.arange(count),
+        costs=jnp.zeros(2),
+        selected=jnp.where(taken, 0, -1),
+        flip_probability=jnp.asarray(0.0),
+        decided=jnp.asarray(True),
+    )
+
+
+def reading(speed_mps=0.0, steering_rad=0.0, has_odometry=True, dt_s=0.1) -> Observation:
+    return Observation(
+        jnp.zeros((1, 1, 4, 2)),
+        jnp.zeros((1, 1), bool),
+        jnp.asarray(speed_mps, float),
+        jnp.asarray(steering_rad, float),
+        jnp.asarray(dt_s, float),
+        has_odometry=jnp.asarray(has_odometry),
+    )
+
+
+@jax.jit
+def drive_step(motion, belief, pose, covariance, taken, obs):
+    """Prediction and update with a planar pose."""
+    prior = motion.predict(belief, obs)
+    selection = chosen(prior, worlds.planar(*pose), covariance, taken)
+    posterior, nis, *_ = motion.update(prior, selection, obs)
+    return prior, posterior, nis
+
+
+@jax.jit
+def coasted(motion, belief, dt_s):
+    """A prediction alone, at rest."""
+    return motion.predict(belief, reading(dt_s=dt_s))
+
+
+def started(motion, pose, covariance, speed_mps=0.3, steering_rad=0.1) -> Bank:
+    obs = reading(speed_mps, steering_rad)
+    return drive_step(motion, motion.init(), jnp.asarray(pose), covariance, True, obs)[1]
+
+
+def patient_car() -> BicycleKalman:
+    """Without a gate: every pose is believed."""
+    return BicycleKalman(worlds.qcar(), gate_nis=np.inf)
+
+
+def planar_part(covariance, psi_rad):
+    """Covariance of (x, y, psi) of a level vehicle from that of xi."""
+    c, s = np.cos(psi_rad), np.sin(psi_rad)
+    J = np.zeros((3, 6))
+    J[:2, :2] = [[c, -s], [s, c]]
+    J[2, 5] = 1
+    return J @ covariance @ J.T
+
+
+@pytest.mark.parametrize("with_pose", [True, False])
+def test_200_steps_are_the_textbook_s(with_pose):
+    """Random poses, odometry and intervals; with pose rows two thirds of the time, or never."""
+    rng = np.random.default_rng(0)
+    motion = patient_car()
+    first = np.array([0.5, -0.3, 3.0])
+    root = 0.02 * rng.normal(size=(6, 6))
+    floor = np.diag(np.asarray(motion.vision_floor) ** 2)
+    belief = started(motion, first, root @ root.T)
+    x, P = np.asarray(belief.mean[0]), np.asarray(belief.covariance[0])
+    for _ in range(200):
+        dt_s, speed = rng.uniform(0.01, 0.2), rng.uniform(-0.2, 0.6)
+        steering = rng.uniform(-0.5, 0.5)
+        root = 0.03 * rng.normal(size=(6, 6))
+        told = speed, steering, WHEELBASE_M
+        x, P = kalman.predict(x, P, dt_s, np.asarray(motion.acceleration_density), told)
+        pose = x[:3] + rng.normal(0, 0.05, 3)
+        sees = with_pose and rng.uniform() < 2 / 3
+        R_pose = planar_part(root @ root.T, pose[2]) + floor
+        x, P, nis_expected = kalman.update(
+            x,
+            P,
+            pose if sees else None,
+            R_pose,
+            speed,
+            steering,
+            WHEELBASE_M,
+            np.asarray(motion.odometry_sigma),
+        )
+        _, belief, nis = drive_step(
+            motion,
+            belief,
+            jnp.asarray(pose),
+            jnp.asarray(root @ root.T),
+            sees,
+            reading(speed, steering, dt_s=dt_s),
+        )
+        np.testing.assert_allclose(kalman.wrap(belief.mean[0, 2] - x[2]), 0, atol=1e-9)
+        np.testing.assert_allclose(np.delete(belief.mean[0], 2), np.delete(x, 2), atol=1e-9)
+        np.testing.assert_allclose(belief.covariance[0], P, atol=1e-9)
+        np.testing.assert_allclose(nis[0], nis_expected, rtol=1e-7)
+
+
+def test_the_heading_s_column_of_H_is_the_derivative():
+    """One odometry update with H by differences of the prediction v(psi) - (v_x, v_y, psi_dot)."""
+    motion = BicycleKalman(worlds.qcar())
+    belief = started(motion, (0.1, 0.2, 1.0), 1e-3 * jnp.eye(6))
+    speed, steering = 0.8, 0.4
+    _, posterior, _ = drive_step(
+        motion, belief, jnp.zeros(3), jnp.eye(6), False, reading(speed, steering, dt_s=0.3)
+    )
+    x, P = kalman.predict(
+        np.asarray(belief.mean[0]),
+        np.asarray(belief.covariance[0]),
+        0.3,
+        np.asarray(motion.acceleration_density),
+        (speed, steering, WHEELBASE_M),
+    )
+
+    def residual(x):
+        return paper.velocity(speed, steering, x[2], WHEELBASE_M) - x[3:]
+
+    h = 1e-6
+    H = -np.stack([(residual(x + h * e) - residual(x - h * e)) / (2 * h) for e in np.eye(6)], 1)
+    assert np.max(np.abs(H[:, 2])) > 0.5
+    R = np.diag(np.asarray(motion.odometry_sigma) ** 2)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    np.testing.assert_allclose(posterior.mean[0], x + K @ residual(x), atol=1e-8)
+    np.testing.assert_allclose(posterior.covariance[0], (np.eye(6) - K @ H) @ P, atol=1e-8)
+    assert posterior.mean[0, 2] != x[2]
+
+
+def test_the_yaw_innovation_wraps():
+    """Prediction at pi - 0.02, pose at -pi + 0.02: 0.04 rad apart and not 6.24."""
+    motion = patient_car()
+    tight = 1e-6 * jnp.eye(6)
+    belief = started(motion, (0.0, 0.0, np.pi - 0.02), tight, 0.0, 0.0)
+    _, posterior, nis = drive_step(
+        motion,
+        belief,
+        jnp.asarray([0.0, 0.0, -np.pi + 0.02]),
+        tight,
+        True,
+        reading(dt_s=0.0),
+    )
+    assert abs(kalman.wrap(float(posterior.mean[0, 2]) - np.pi)) < 0.02
+    variance = 1e-6 + float(motion.vision_floor[2]) ** 2
+    assert nis[0] == pytest.approx(0.04**2 / (2 * variance), rel=1e-3)
+    assert -np.pi <= posterior.mean[0, 2] < np.pi
+
+
+def test_odometry_alone_moves_the_car_along_its_arc(precision):
+    motion = BicycleKalman(worlds.qcar())
+    speed, steering, dt_s = 0.5, 0.3, 0.05
+    belief = started(motion, (1.0, 0.5, 0.2), 1e-6 * jnp.eye(6), speed, steering)
+    start = np.asarray(belief.mean[0, :3])
+    variances = []
+    for _ in range(40):
+        obs = reading(speed, steering, dt_s=dt_s)
+        _, belief, nis = drive_step(motion, belief, jnp.zeros(3), jnp.eye(6), False, obs)
+        assert nis[0] == 0
+        variances.append(float(belief.covariance[0, 0, 0] + belief.covariance[0, 1, 1]))
+    assert belief.mean.dtype == belief.covariance.dtype == precision
+    truth = paper.drive(start, speed, steering, 40 * dt_s, WHEELBASE_M)[-1]
+    np.testing.assert_allclose(belief.mean[0, :2], truth[:2], atol=0.05)
+    assert abs(kalman.wrap(float(belief.mean[0, 2]) - truth[2])) < 0.05
+    assert np.all(np.diff(variances) > 0)
+
+
+def test_without_odometry_the_rows_are_gone():
+    motion = BicycleKalman(worlds.qcar())
+    belief = started(motion, (1.0, 0.5, 0.2), 1e-4 * jnp.eye(6))
+    prior, posterior, _ = drive_step(
+        motion, belief, jnp.zeros(3), jnp.eye(6), False, reading(9.0, 0.4, False)
+    )
+    x, P = kalman.predict(
+        np.asarray(belief.mean[0]),
+        np.asarray(belief.covariance[0]),
+        0.1,
+        np.asarray(motion.acceleration_density),
+    )
+    np.testing.assert_allclose(posterior.mean[0], x, rtol=1e-12)
+    np.testing.assert_allclose(posterior.covariance[0], P, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(posterior.mean, prior.mean)
+
+
+def test_nis_of_a_matched_filter_is_chi_square():
+    """Truth drawn from the filter's own model; poses only. 400 steps of 3 degrees of freedom."""
+    rng = np.random.default_rng(1)
+    motion = BicycleKalman(worlds.qcar())
+    dt_s, density = 0.1, np.asarray(motion.acceleration_density)
+    covariance = np.diag([0.02, 0.02, 0, 0, 0, 0.03]) ** 2 + 1e-18 * np.eye(6)
+    R = np.diag([0.02, 0.02, 0.03]) ** 2 + np.diag(np.asarray(motion.vision_floor) ** 2)
+    x = np.array([0.0, 0.0, 0.5, 0.3, -0.2, 0.1])
+    belief = motion.init()
+    values = []
+    for _ in range(401):
+        zero = np.zeros((6, 6))
+        _, Q = kalman.predict(np.zeros(6), zero, dt_s, density)
+        x = kalman.predict(x, zero, dt_s, density)[0] + rng.multivariate_normal(np.zeros(6), Q)
+        pose = rng.multivariate_normal(x[:3], R)
+        _, belief, nis = drive_step(
+            motion,
+            belief,
+            jnp.asarray(pose),
+            jnp.asarray(covariance),
+            True,
+            reading(has_odometry=False, dt_s=dt_s),
+        )
+        values.append(float(nis[0]))
+    assert values[0] == 0
+    values = np.array(values[1:])
+    low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], 3 * len(values))
+    assert low < np.sum(values) < high
+    assert stats.kstest(values, stats.chi2(3).cdf).pvalue > 1e-3
+
+
+ONSETS = {"into a turn": ((0.4, 0.0), (0.4, 0.45)), "a start": ((0.0, 0.0), (0.5, 0.3)),
+          "a brake": ((0.6, -0.3), (0.0, -0.3))}  # fmt: skip
+
+
+@pytest.mark.parametrize(("before", "after"), ONSETS.values(), ids=ONSETS)
+def test_a_velocity_that_changed_inside_an_interval_surprises_nobody(before, after):
+    """At its onset the NIS of the true pose is that of three numbers, whenever it changed.
+
+    What the prediction would say of the truth without that noise, the textbook's filter tells.
+    """
+    motion = BicycleKalman(worlds.qcar(), gate_nis=np.inf)
+    dt_s, start, density = 0.1, np.array([0.5, -0.3, 0.7]), np.asarray(motion.acceleration_density)
+    sharp = np.diag([1e-3, 1e-3, 0, 0, 0, 1e-3]) ** 2 + 1e-18 * np.eye(6)
+    R_pose = planar_part(sharp, start[2]) + np.diag(np.asarray(motion.vision_floor) ** 2)
+    odometry = np.asarray(motion.odometry_sigma)
+    belief, pose = motion.init(), start
+    for _ in range(20):  # settled in the old velocity
+        told = reading(*before, dt_s=dt_s)
+        _, belief, _ = drive_step(motion, belief, jnp.asarray(pose), jnp.asarray(sharp), True, told)
+        pose = paper.drive(pose, *before, dt_s, WHEELBASE_M)[-1]
+    begun = paper.drive(start, *before, 19 * dt_s, WHEELBASE_M)[-1]
+    x, P = np.asarray(belief.mean[0]), np.asarray(belief.covariance[0])
+
+    with_change, without = [], []
+    for share in (np.arange(10) + 0.5) / 10:
+        truth = begun
+        for command, part in ((before, share), (after, 1 - share)):
+            truth = paper.drive(truth, *command, part * dt_s, WHEELBASE_M)[-1]
+        told = reading(*after, dt_s=dt_s)
+        *_, nis = drive_step(motion, belief, jnp.asarray(truth), jnp.asarray(sharp), True, told)
+        with_change.append(float(nis[0]))
+        x_later, P_later = kalman.predict(x, P, dt_s, density)
+        without.append(
+            kalman.update(x_later, P_later, truth, R_pose, *after, WHEELBASE_M, odometry)[2]
+        )
+    # Nothing but the instant is unknown here: one number of the three.
+    assert 0.5 < np.mean(with_change) < 3
+    assert np.max(with_change) < stats.chi2(3).ppf(0.95)
+    assert np.max(without) > stats.chi2(3).ppf(0.9999)
+
+
+def outlier_steps(kind: str, **options):
+    """A step of one hypothesis of either model with a planar pose, at rest."""
+    car = kind == "car"
+    motion = BicycleKalman(worlds.qcar(), **options) if car else ConstantVelocity(**options)
+
+    def step(belief, x_m, taken=True):
+        pose, covariance = jnp.asarray([x_m, 0.0, 0.0]), 1e-4 * jnp.eye(6)
+        return drive_step(motion, belief, pose, covariance, taken, reading(dt_s=0.02))
+
+    return motion, step
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_the_gate_keeps_an_outlier_out(kind):
+    """The state is the prediction's, the NIS that of the pose that was offered."""
+    motion, step = outlier_steps(kind)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    assert belief.rejections.count[0] == 0
+    prior, after, nis = step(belief, 0.3)
+    blind_prior, blind, _ = step(belief, 0.3, taken=False)
+    np.testing.assert_array_equal(prior.mean, blind_prior.mean)
+    np.testing.assert_array_equal(after.mean, blind.mean)
+    np.testing.assert_array_equal(after.covariance, blind.covariance)
+    innovation, floor = np.zeros(6), np.zeros((6, 6))
+    floor[np.diag_indices(6)] = 1e-4
+    if kind == "car":
+        innovation = np.array([0.3, 0, 0]) - np.asarray(prior.mean)[0, :3]
+        S = np.asarray(prior.covariance)[0, :3, :3] + floor[:3, :3]
+    else:
+        T = worlds.planar(0.3, 0.0, 0.0)
+        innovation = np.asarray((jaxlie.SE3(prior.mean[0, :7]).inverse() @ T).log())
+        S = np.asarray(prior.covariance)[0, :6, :6] + floor
+    S = S + np.diag(np.asarray(motion.vision_floor) ** 2)
+    assert nis[0] == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9)
+    assert nis[0] > motion.gate_nis
+    assert after.rejections.count[0] == 1
+    # Where nothing is offered it is not counted, and the next good one clears the count.
+    _, unseen, _ = step(after, 0.0, taken=False)
+    assert unseen.rejections.count[0] == 1
+    _, again, nis = step(unseen, 0.0)
+    assert nis[0] < motion.gate_nis
+    assert again.rejections.count[0] == 0
+
+
+@pytest.mark.parametrize(("kind", "dof"), [("car", 3), ("free", 6)])
+def test_the_gate_is_where_chi_square_has_9999(kind, dof):
+    motion, _ = outlier_steps(kind)
+    assert motion.gate_nis == pytest.approx(stats.chi2.ppf(0.9999, dof), abs=0.1)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_ten_rejections_in_a_row_start_it_anew(kind):
+    motion, step = outlier_steps(kind)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for count in range(1, motion.max_rejections + 1):
+        prior, belief, nis = step(belief, 5.0)
+        assert prior.initialised[0]
+        assert nis[0] > motion.gate_nis
+        assert int(belief.rejections.count[0]) == count
+        assert abs(float(motion.poses(belief).T_world_vehicle.translation()[0, 0])) < 0.1
+    prior, belief, nis = step(belief, 5.0)
+    assert not prior.initialised[0]
+    assert belief.initialised[0]
+    assert (nis[0], belief.rejections.count[0]) == (0, 0)
+    position_m = motion.poses(belief).T_world_vehicle.translation()[0]
+    np.testing.assert_allclose(position_m, [5.0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_without_a_gate_every_pose_is_fused_and_nothing_starts_anew(kind):
+    """Poses that run away ever faster: each is far off, all to one side, for longer than a row of
+    rejections may last. The gain is the scalar one, P / (P + R), along x."""
+    motion, step = outlier_steps(kind, gate_nis=np.inf, max_rejected_s=0.3)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    R = 1e-4 + float(motion.vision_floor[0]) ** 2
+    for count in range(1, 3 * motion.max_rejections):
+        pose_m = 0.1 * count**2
+        prior, belief, nis = step(belief, pose_m)
+        predicted_m, fused_m = (
+            float(motion.poses(bank).T_world_vehicle.translation()[0, 0])
+            for bank in (prior, belief)
+        )
+        P = float(prior.covariance[0, 0, 0])
+        assert nis[0] == pytest.approx((pose_m - predicted_m) ** 2 / (P + R))
+        assert nis[0] > 30  # above either gate
+        assert fused_m == pytest.approx(predicted_m + P / (P + R) * (pose_m - predicted_m))
+        assert prior.initialised[0]
+        assert (belief.rejections.count[0], belief.rejections.duration_s[0]) == (0, 0)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_rejections_that_contradict_each_other_start_nothing(kind):
+    """A reflection here, then there (docs/design.md, Restart): only later it starts anew."""
+    patience = 30  # steps of 0.02 s
+    motion, step = outlier_steps(kind, max_rejected_s=0.02 * patience - 0.001)
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for count in range(patience):
+        prior, belief, nis = step(belief, 5.0 if count % 2 else -5.0)
+        assert prior.initialised[0]
+        assert nis[0] > motion.gate_nis
+        assert belief.rejections.count[0] == 1
+        assert belief.rejections.duration_s[0] == pytest.approx(0.02 * (count + 1))
+    prior, belief, _ = step(belief, 5.0)
+    assert not prior.initialised[0]
+    assert (belief.rejections.count[0], belief.rejections.duration_s[0]) == (0, 0)
+
+
+@pytest.mark.parametrize("coasts", [1, 4])
+def test_rejections_last_as_long_as_the_clock_says(coasts):
+    """Whatever comes between two poses, odometry say, and however often: its time counts too."""
+    motion, step = outlier_steps("car", max_rejected_s=0.5)
+    belief, forgotten_s = motion.init(), None
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for count in range(40):
+        for _ in range(coasts):
+            belief = coasted(motion, belief, 0.02)
+        prior, belief, _ = step(belief, 5.0 if count % 2 else -5.0)
+        if not prior.initialised[0]:
+            forgotten_s = 0.02 * (1 + coasts) * count
+            break
+    assert forgotten_s == pytest.approx(0.5, abs=0.02 * (1 + coasts))
+
+
+def test_a_pause_without_poses_contradicts_for_a_second_at_most():
+    motion, step = outlier_steps("car")
+    belief = motion.init()
+    for _ in range(20):
+        _, belief, _ = step(belief, 0.0)
+    for seconds in (1.0, 2.0):
+        for _ in range(20):
+            belief = coasted(motion, belief, 0.5)
+        assert belief.initialised[0]
+        _, belief, _ = step(belief, 5000.0 * (-1) ** seconds)
+        assert belief.rejections.duration_s[0] == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_hypotheses_are_filters_of_their_own(kind):
+    """Three at once are three alone; one that is not kept starts anew."""
+    motion, _ = outlier_steps(kind)
+    poses = jnp.asarray([[0.0, 0.0, 0.0], [1.0, 0.5, 2.0], [0.3, -1.0, -3.0]])
+    R = 1e-3 * jnp.eye(6)
+
+    @jax.jit
+    def drive(belief, poses, kept):
+        for offset in (0.0, 0.01, 0.03):
+            prior = motion.predict(belief, reading(0.2, 0.1))
+            Ts = worlds.T_world_vehicle_from_planar(poses + offset)
+            selection = dataclasses.replace(
+                chosen(prior, worlds.planar(0.0, 0.0, 0.0), R, True),
+                measured=PoseMeasurement(
+                    Ts,
+                    jnp.tile(R, (len(poses), 1, 1)),
+                    jnp.zeros(len(poses)),
+                    jnp.ones(len(poses), bool),
+                ),
+                kept=prior.initialised & kept,
+            )
+            belief, nis, *_ = motion.update(prior, selection, reading(0.2, 0.1))
+        return belief, nis
+
+    kept = jnp.asarray([True, False, True])
+    together, nis = drive(motion.init(3), poses, kept)
+    for index in range(3):
+        alone, own = drive(motion.init(), poses[index][None], kept[index][None])
+        np.testing.assert_allclose(together.mean[index], alone.mean[0], atol=1e-12)
+        np.testing.assert_allclose(together.covariance[index], alone.covariance[0], atol=1e-12)
+        assert nis[index] == pytest.approx(float(own[0]), rel=1e-9)
+    assert nis[1] == 0
+    np.testing.assert_allclose(
+        motion.poses(together).T_world_vehicle.translation()[1],
+        worlds.planar(*(poses[1] + 0.03)).translation(),
+        atol=1e-9,
+    )
+
+
+@jax.jit
+def first_step(motion, pose, taken):
+    """The belief after one look, its NIS, and the poses a selector sees."""
+    prior = motion.predict(motion.init(), reading())
+    belief, nis, *_ = motion.update(prior, chosen(prior, pose, 1e-4 * jnp.eye(6), taken), reading())
+    return belief, nis, motion.poses(belief)
+
+
+@pytest.mark.parametrize(("kind", "size"), [("car", 6), ("free", 12)])
+def test_the_first_pose_starts_the_filter(precision, kind, size):
+    motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
+    assert isinstance(motion, Motion)
+    assert not motion.init().initialised[0]
+    pose = worlds.planar(0.4, -0.2, 2.0)
+    blind, *_ = first_step(motion, pose, False)
+    assert not blind.initialised[0]
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(blind))
+    belief, nis, found = first_step(motion, pose, True)
+    assert belief.initialised[0]
+    assert nis[0] == 0
+    assert belief.covariance.shape == (1, size, size)
+    assert found.covariance.dtype == precision
+    R, position_m = pose.rotation().as_matrix(), pose.translation()
+    np.testing.assert_allclose(found.T_world_vehicle.rotation().as_matrix()[0], R, atol=1e-6)
+    np.testing.assert_allclose(found.T_world_vehicle.translation()[0], position_m, atol=1e-6)
+
+
+def test_poses_of_a_car_are_level_and_carry_the_planar_covariance():
+    motion = BicycleKalman(worlds.qcar())
+    root = np.random.default_rng(2).normal(size=(6, 6))
+    P = root @ root.T
+    belief = Bank(
+        jnp.asarray([[0.3, -0.4, 2.0, 0.1, 0.2, 0.3]]),
+        jnp.asarray(P[None]),
+        jnp.zeros(1),
+        jnp.ones(1, bool),
+        motion.init().rejections,
+        jnp.zeros(1, int),
+        motion.init().velocity_lead,
+        jnp.zeros(1, int),
+    )
+    found = motion.poses(belief)
+    expected = np.asarray(worlds.planar(0.3, -0.4, 2.0).wxyz_xyz)
+    np.testing.assert_allclose(found.T_world_vehicle.wxyz_xyz[0], expected, atol=1e-15)
+    np.testing.assert_allclose(planar_part(found.covariance[0], 2.0), P[:3, :3], atol=1e-12)
+    np.testing.assert_array_equal(found.covariance[0, 2:5], 0)
+
+
+def test_broken_hypotheses_start_anew():
+    start = BicycleKalman(worlds.qcar()).init()
+    stack = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf + 1, leaf + 2]), start)
+    stack = eqx.tree_at(lambda b: b.initialised, stack, jnp.ones(3, bool))
+    starts = BicycleKalman(worlds.qcar()).init(3)
+    broken = eqx.tree_at(lambda b: b.mean, stack, stack.mean.at[1, 4].set(jnp.nan))
+    broken = eqx.tree_at(lambda b: b.covariance, broken, broken.covariance.at[2, 0, 5].set(jnp.inf))
+    kept = restart_broken(broken, starts)
+    assert kept.initialised.tolist() == [True, False, False]
+    np.testing.assert_array_equal(kept.mean[0], stack.mean[0])
+    np.testing.assert_array_equal(kept.mean[1:], 0)
+    assert np.all(np.isfinite(kept.covariance))
+
+
+@pytest.mark.parametrize(
+    ("nis", "inflation", "taken"), [(20.0, 1.0, True), (22.0, 1.0, False), (22.0, 2.0, True)]
+)
+def test_what_the_gate_accepts_is_told(nis, inflation, taken):
+    """Wider where prediction and corners vary more than they say; counted all the same."""
+    bank = jax.tree.map(lambda leaf: leaf[0], BicycleKalman(worlds.qcar()).init())
+    bank = eqx.tree_at(lambda b: b.initialised, bank, jnp.asarray(True))
+    posterior = bank.mean + 1, bank.covariance
+    offer = Offer(jnp.asarray([np.sqrt(nis), 0, 0]), posterior, 21.1, jnp.zeros(()), inflation)
+    after, own, accepted = apply_gate(bank, offer, posterior, jnp.asarray(True))
+    assert (float(own), bool(accepted)) == (pytest.approx(nis), taken)
+    assert bool(jnp.all(after.mean == bank.mean + taken))
+    assert int(after.rejections.count) == (nis > 21.1)
+
+
+@pytest.mark.parametrize("kind", ["car", "free"])
+def test_a_state_on_the_ground_and_its_covariance(kind):
+    """Pose and velocity as a small time later tells, covariances as samples do."""
+    rng = np.random.default_rng(3)
+    car = BicycleKalman(worlds.qcar())
+    motion = car if kind == "car" else ConstantVelocity(acceleration_density=jnp.zeros(6))
+    if kind == "car":
+        mean = jnp.asarray([0.4, -0.2, 1.1, 0.3, -0.1, 0.5])
+    else:
+        tilted = jaxlie.SE3.exp(jnp.asarray([0.3, -0.4, 0.1, 0.2, -0.3, 0.9]))
+        mean = jnp.append(tilted.wxyz_xyz, jnp.asarray([0.3, -0.1, 0.2, 0.4, -0.2, 0.5]))
+    size = motion.init().covariance.shape[-1]
+    root = 1e-3 * rng.standard_normal((size, size))
+    told = eqx.filter_jit(motion.planar)(mean, jnp.asarray(root @ root.T))
+    dt_s = 1e-6
+    bank = eqx.tree_at(lambda b: b.mean, motion.init(), mean[None])
+    if kind == "free":
+        later = eqx.filter_jit(motion.predict)(bank, reading(dt_s=dt_s))
+        moved = eqx.filter_jit(motion.on_ground)(later.mean[0])[0]
+    else:
+        moved = mean[:3] + dt_s * mean[3:]
+    np.testing.assert_allclose((moved - told.pose) / dt_s, told.velocity, atol=1e-5)
+    errors = jnp.asarray(rng.standard_normal((20_000, size)) @ root.T)
+    poses, velocities = jax.jit(
+        jax.vmap(lambda error: motion.on_ground(motion.moved(mean, error)))
+    )(errors)
+    for samples, covariance in (
+        (poses, told.pose_covariance),
+        (velocities, told.velocity_covariance),
+    ):
+        scale = np.sqrt(np.outer(np.diagonal(covariance), np.diagonal(covariance)))
+        np.testing.assert_allclose(
+            np.cov(np.asarray(samples).T) / scale, covariance / scale, atol=0.05
+        )
+
+
+@jax.jit
+def free_step(motion, belief, dt_s, wxyz_xyz, covariance, taken):
+    obs = reading(dt_s=dt_s)
+    prior = motion.predict(belief, obs)
+    selection = chosen(prior, jaxlie.SE3(wxyz_xyz), covariance, taken)
+    return motion.update(prior, selection, obs)[:2]
+
+
+def test_constant_velocity_carries_its_covariance_as_samples_do():
+    """Without process noise 20 000 samples moved by the exact motion have the predicted one."""
+    motion = ConstantVelocity(acceleration_density=jnp.zeros(6))
+    rng = np.random.default_rng(3)
+    root = 0.01 * rng.normal(size=(12, 12))
+    twist = jnp.asarray([0.4, -0.2, 0.1, 0.3, -0.5, 0.8])
+    T = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6)))
+    belief = Bank(
+        jnp.append(T.wxyz_xyz, twist)[None],
+        jnp.asarray((root @ root.T)[None]),
+        jnp.zeros(1),
+        jnp.ones(1, bool),
+        motion.init().rejections,
+        jnp.zeros(1, int),
+        motion.init().velocity_lead,
+        jnp.zeros(1, int),
+    )
+    dt_s = 0.1
+    predicted = motion.predict(belief, reading(dt_s=dt_s))
+
+    @jax.jit
+    @jax.vmap
+    def moved(error):
+        truth = T @ jaxlie.SE3.exp(error[:6]) @ jaxlie.SE3.exp((twist + error[6:]) * dt_s)
+        believed = jaxlie.SE3(predicted.mean[0, :7])
+        return jnp.append((believed.inverse() @ truth).log(), error[6:])
+
+    count = 20_000
+    errors = np.asarray(moved(jnp.asarray(rng.normal(size=(count, 12)) @ root.T)))
+    P = np.asarray(predicted.covariance[0])
+    whitened = np.linalg.solve(np.linalg.cholesky(P), errors.T)
+    # Sampling noise, and 5 % for the Jacobian of exp that F leaves out (half the turn, 0.05 rad).
+    np.testing.assert_allclose(
+        whitened @ whitened.T / count, np.eye(12), atol=0.05 + 5 / np.sqrt(count)
+    )
+
+
+def with_twist(obs: Observation, twist) -> Observation:
+    return dataclasses.replace(obs, twist=jnp.asarray(twist, float))
+
+
+def test_odometry_s_motion_carries_its_covariance_as_samples_do():
+    """20 000 bodies that start off by P, and drift off the motion that is told."""
+    drift = jnp.asarray([0.05, 0.04, 0.03, 0.02])
+    A = jnp.asarray([0.3, 0.2, 0.1, 0.2, 0.3, 0.1])
+    motion = ConstantVelocity(acceleration_density=A, odometry_drift=drift)
+    rng = np.random.default_rng(5)
+    root = 0.01 * rng.normal(size=(12, 12))
+    told = np.array([0.4, -0.2, 0.1, 0.3, -0.1, 0.2])
+    T = jaxlie.SE3.exp(jnp.asarray(rng.normal(size=6)))
+    start = eqx.tree_at(
+        lambda b: (b.mean, b.covariance, b.initialised),
+        motion.init(),
+        (
+            jnp.append(T.wxyz_xyz, jnp.full(6, 9.0))[None],  # what the state believes of the twist
+            jnp.asarray((root @ root.T)[None]),
+            jnp.ones(1, bool),
+        ),
+    )
+    dt_s = 0.2
+    predicted = motion.predict(start, with_twist(reading(dt_s=dt_s), told))
+    np.testing.assert_allclose(predicted.mean[0, 7:], told)
+    way_m, angle_rad = (dt_s * np.linalg.norm(part) for part in (told[:3], told[3:]))
+    linear = 0.05**2 * way_m + 0.03**2 * dt_s
+    angular = 0.04**2 * angle_rad + 0.02**2 * dt_s
+
+    @jax.jit
+    @jax.vmap
+    def off(error, drifted, later):
+        truth = T @ jaxlie.SE3.exp(error) @ jaxlie.SE3.exp(told * dt_s) @ jaxlie.SE3.exp(drifted)
+        believed = jaxlie.SE3(predicted.mean[0, :7])
+        return jnp.append((believed.inverse() @ truth).log(), drifted / dt_s + later)
+
+    count = 20_000
+    errors = off(
+        jnp.asarray(rng.normal(size=(count, 12)) @ root.T)[:, :6],
+        jnp.asarray(rng.normal(size=(count, 6)) * np.sqrt(np.repeat([linear, angular], 3))),
+        jnp.asarray(rng.normal(size=(count, 6)) * np.sqrt(A * dt_s / 3)),
+    )
+    factor = np.linalg.cholesky(np.asarray(predicted.covariance[0]))
+    whitened = np.linalg.solve(factor, np.asarray(errors).T)
+    np.testing.assert_allclose(whitened @ whitened.T / count, np.eye(12), atol=5 / np.sqrt(count))
+
+
+def test_odometry_s_drift_does_not_depend_on_how_often_it_is_read():
+    motion = ConstantVelocity(odometry_drift=jnp.asarray([0.05, 0.0, 0.03, 0.0]))
+    T, twist = worlds.planar(0.3, 0.1, 1.0), [0.5, 0, 0, 0, 0, 0]
+    start, _ = free_step(motion, motion.init(), jnp.asarray(0.1), T.wxyz_xyz, jnp.eye(6), True)
+    start = eqx.tree_at(lambda b: b.covariance, start, 1e-8 * jnp.eye(12)[None])
+    predict = jax.jit(lambda bank, obs: motion.predict(bank, obs))
+    seldom = predict(start, with_twist(reading(dt_s=2.0), twist))
+    often = start
+    for _ in range(20):
+        often = predict(often, with_twist(reading(dt_s=0.1), twist))
+    np.testing.assert_allclose(often.mean[0, :7], seldom.mean[0, :7], atol=1e-12)
+    np.testing.assert_allclose(
+        often.covariance[0, :3, :3], seldom.covariance[0, :3, :3], rtol=1e-3, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e4])
+def test_a_twist_that_is_no_motion_is_not_used(bad):
+    motion = ConstantVelocity()
+    start, _ = free_step(
+        motion, motion.init(), jnp.asarray(0.1), worlds.planar(0, 0, 0).wxyz_xyz, jnp.eye(6), True
+    )
+    obs = reading(dt_s=0.1)
+    for left, right in zip(
+        jax.tree.leaves(motion.predict(start, with_twist(obs, [bad, 0, 0, 0, 0, 0]))),
+        jax.tree.leaves(motion.predict(start, obs)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(left, right)
+
+
+def test_constant_velocity_converges_on_a_moving_body():
+    """Noisy poses of a body that screws through space: pose and twist are found, errors as said."""
+    motion = ConstantVelocity(acceleration_density=jnp.full(6, 0.05**2))
+    rng = np.random.default_rng(4)
+    twist = jnp.asarray([0.5, 0.1, -0.2, 0.2, -0.1, 0.6])
+    T = jaxlie.SE3.identity()
+    sigma = np.array([0.01] * 3 + [0.02] * 3)
+    dt_s = jnp.asarray(0.05)
+    belief, normalised, values = motion.init(), [], []
+    advance = jax.jit(lambda T, xi: T @ jaxlie.SE3.exp(xi))
+    for step in range(200):
+        T = advance(T, twist * dt_s)
+        noisy = advance(T, jnp.asarray(sigma * rng.standard_normal(6)))
+        belief, nis = free_step(
+            motion, belief, dt_s, noisy.wxyz_xyz, jnp.asarray(np.diag(sigma**2)), True
+        )
+        if step >= 50:
+            values.append(float(nis[0]))
+            gap = (jaxlie.SE3(belief.mean[0, :7]).inverse() @ T).log()
+            error = np.append(gap, twist - belief.mean[0, 7:])
+            normalised.append(error @ np.linalg.solve(belief.covariance[0], error))
+    np.testing.assert_allclose(belief.mean[0, 7:], twist, atol=0.06)
+    assert np.linalg.norm(gap[:3]) < 0.01
+    assert np.linalg.norm(gap[3:]) < 0.02
+    # The floor adds to R what the simulation leaves out; successive errors are correlated.
+    assert 4 < np.mean(values) < 7
+    assert 4 < np.mean(normalised) < 16
+
+
+def test_constant_velocity_forgets_what_it_lost():
+    motion = ConstantVelocity()
+    pose = worlds.planar(0.3, 0.1, 1.0)
+    belief, _ = free_step(
+        motion, motion.init(), jnp.asarray(0.1), pose.wxyz_xyz, 1e-4 * jnp.eye(6), True
+    )
+    assert motion.predict(belief, reading(dt_s=0.1)).initialised[0]
+    assert not motion.predict(belief, reading(dt_s=10.0)).initialised[0]
+    there = worlds.planar(-3.0, 2.0, -2.0)
+    again, nis = free_step(
+        motion, belief, jnp.asarray(10.0), there.wxyz_xyz, 1e-4 * jnp.eye(6), True
+    )
+    np.testing.assert_allclose(again.mean[0, :7], there.wxyz_xyz, atol=1e-12)
+    np.testing.assert_array_equal(again.mean[0, 7:], 0)
+    assert nis[0] == 0
+
+
+@pytest.mark.parametrize("kind", ["car", "free", "free with odometry"])
+@in_float32
+def test_gradients_are_finite_at_rest_and_at_the_prediction(precision, kind):
+    """Of everything by noise parameters, pose and odometry, where innovations are 0."""
+    motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
+    pose = worlds.planar(0.3, 0.1, 1.0)
+
+    @jax.jit
+    @jax.grad
+    def slope(floats, taken):
+        motion, wxyz_xyz, speed_mps, dt_s = floats
+        obs = reading(speed_mps, dt_s=dt_s)
+        if kind == "free with odometry":
+            obs = with_twist(obs, jnp.zeros(6) * speed_mps)
+
+        def look(prior, taken):
+            here = chosen(prior, jaxlie.SE3(wxyz_xyz), 1e-4 * jnp.eye(6), taken)
+            return motion.update(prior, here, obs)[:2]
+
+        belief, _ = look(motion.init(), True)
+        for _ in range(2):
+            belief, nis = look(motion.predict(belief, obs), taken)
+        return jnp.sum(belief.mean) + jnp.sum(belief.covariance) + jnp.sum(nis)
+
+    for taken in (True, False):
+        zero = jnp.asarray(0.0)
+        for leaf in jax.tree.leaves(slope((motion, pose.wxyz_xyz, zero, zero), taken)):
+            assert leaf.dtype == precision
+            assert np.all(np.isfinite(leaf))

@@ -1,0 +1,312 @@
+"""The candidates: both poses of every sighting, merged and pruned."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+import scipy.optimize
+
+from jaxnav.core.models.geometry import planar_from_T_world_vehicle
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.residuals import e1
+from tests import worlds
+from tests.derivatives import in_float32
+
+ROOM_VIEW = (0.2, 0.1, 0.6)
+SIZES = ("max_sightings", "max_candidates", "max_steps", "ground_plane")
+
+
+@functools.partial(jax.jit, static_argnames=SIZES)
+def find(
+    rig,
+    markers,
+    obs,
+    corner_sigma_px=1.0,
+    model_sigma_px=0.15,
+    max_sightings=16,
+    max_candidates=4,
+    max_steps=60,
+    ground_plane=False,
+):
+    snapshot = Snapshot.create(rig, markers, obs, corner_sigma_px, model_sigma_px, max_sightings)
+    return find_candidates(snapshot, max_candidates, max_steps, ground_plane)
+
+
+def view(markers, pose, sigma_px=0.0, seed=0):
+    rig = worlds.qcar_rig()
+    noise = sigma_px * np.random.default_rng(seed).standard_normal((4, len(markers.ids), 4, 2))
+    return rig, markers, worlds.observe(rig, markers, worlds.planar(*pose), jnp.asarray(noise))
+
+
+def pose_errors(candidates: Candidates, pose) -> np.ndarray:
+    """(N, 2): metres and radians from the truth."""
+    truth = worlds.planar(*pose)
+    xi = jax.vmap(lambda T: (truth.inverse() @ T.inverse()).log())(candidates.T_vehicle_world)
+    return np.stack([np.linalg.norm(xi[:, :3], axis=1), np.linalg.norm(xi[:, 3:], axis=1)], axis=1)
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.5])
+def test_one_camera_and_one_marker_give_two(precision, sigma_px):
+    candidates = find(*view(worlds.paper_markers(), worlds.START_VIEW, sigma_px))
+    assert candidates.valid.tolist() == [True, True, False, False]
+    errors = pose_errors(candidates, worlds.START_VIEW)
+    assert candidates.e1_px2.dtype == precision
+    if sigma_px == 0:
+        assert errors[0, 0] < (0.01 if precision == np.float32 else 1e-7)
+        # The mirror pose is far away and nearly as good: the problem the paper is about.
+        assert errors[1, 1] > 0.5
+        assert candidates.e1_px2[1] < 10
+    else:
+        assert errors[:2, 0].min() < 0.5
+
+
+def test_two_cameras_on_one_marker_merge_to_two():
+    rig, markers, obs = view(worlds.paper_markers(), worlds.OVERLAP_VIEW, 0.3, seed=3)
+    candidates = find(rig, markers, obs)
+    assert np.all(candidates.converged)
+    assert 1 <= int(np.sum(candidates.valid)) <= 2
+    distinct = pose_errors(candidates, worlds.OVERLAP_VIEW)[np.asarray(candidates.valid)]
+    assert distinct[0, 0] < 0.05
+    # All four lanes were refined on the joint e1; what is left out repeats a kept one.
+    kept = np.asarray(candidates.T_vehicle_world.as_matrix())[np.asarray(candidates.valid)]
+    for index in np.flatnonzero(~np.asarray(candidates.valid)):
+        T = np.asarray(candidates.T_vehicle_world.as_matrix())[index]
+        assert np.min(np.abs(kept - T).max(axis=(1, 2))) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("sigma_px", "seed"), [(0.3, 20), (0.3, 22), (0.3, 24), (1.0, 7), (1.0, 25), (1.0, 38)]
+)
+def test_what_still_falls_towards_another_minimum_is_no_candidate(sigma_px, seed):
+    """Where it is after a number of steps is decided by rounding."""
+    rig, markers, obs = view(worlds.paper_markers(), worlds.OVERLAP_VIEW, sigma_px, seed)
+    stopped, ended = (find(rig, markers, obs, max_steps=steps) for steps in (12, 60))
+    assert stopped.valid[0]
+    e1_px2 = np.asarray(stopped.e1_px2)[np.asarray(stopped.valid)]
+    at_end = np.asarray(ended.e1_px2)[np.asarray(ended.valid)]
+    np.testing.assert_allclose(e1_px2, at_end[: len(e1_px2)], rtol=0.02)
+
+
+def test_two_cameras_agree_on_two_distinct_poses():
+    """Farther away, where the mirror pose is a minimum of the joint e1 as well."""
+    pose = (1.2, -1.6, np.deg2rad(75.0))
+    rig, markers, obs = view(worlds.paper_markers(), pose, 0.2, seed=1)
+    assert int(np.sum(obs.visible)) == 2
+    candidates = find(rig, markers, obs)
+    assert int(np.sum(candidates.valid)) == 2
+    errors = pose_errors(candidates, pose)[np.asarray(candidates.valid)]
+    assert errors[:, 1].min() < 0.2
+    assert errors[:, 1].max() > 0.5
+
+
+def test_several_markers_leave_no_doubt():
+    candidates = find(*view(worlds.room_markers(), ROOM_VIEW, 0.3))
+    assert candidates.valid[0]
+    assert candidates.converged[0]
+    errors = pose_errors(candidates, ROOM_VIEW)
+    assert errors[0, 0] < 0.01
+    assert errors[0, 1] < 0.01
+    others = np.flatnonzero(candidates.valid)[1:]
+    assert np.all(np.asarray(candidates.e1_px2)[others] > 100 * candidates.e1_px2[0])
+
+
+def test_costs_are_what_they_say():
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    candidates = find(rig, markers, obs, corner_sigma_px=jnp.asarray(0.3))
+    image_errors = jax.jit(jax.vmap(lambda T: e1(rig, markers, obs.corners_px, obs.visible, T)))(
+        candidates.T_vehicle_world
+    )
+    np.testing.assert_allclose(candidates.e1_px2, image_errors, rtol=1e-9)
+    np.testing.assert_allclose(candidates.cost, candidates.e1_px2 / 0.3**2, rtol=1e-9)
+    valid = np.asarray(candidates.e1_px2)[np.asarray(candidates.valid)]
+    assert np.all(np.diff(valid) >= 0)
+
+
+def test_an_observation_s_own_sigma_is_used_with_the_model_s():
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    sigma = jnp.full((4, 4, 4), 0.4)
+    own = Observation(obs.corners_px, obs.visible, corner_sigma_px=sigma)
+    candidates = find(rig, markers, own, model_sigma_px=jnp.asarray(0.3))
+    np.testing.assert_allclose(candidates.cost[0], candidates.e1_px2[0] / 0.5**2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("filler", [np.nan, np.inf, 1e25, -7.0])
+def test_hidden_lanes_change_nothing(filler):
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    clean = find(rig, markers, obs)
+    hidden = ~obs.visible[:, :, None, None]
+    filled = eqx.tree_at(lambda o: o.corners_px, obs, jnp.where(hidden, filler, obs.corners_px))
+    for leaf, expected in zip(
+        jax.tree.leaves(find(rig, markers, filled)), jax.tree.leaves(clean), strict=True
+    ):
+        np.testing.assert_array_equal(leaf, expected)
+
+
+@pytest.mark.parametrize("filler", [np.nan, 0.0])
+def test_nothing_in_view_gives_no_candidate(precision, filler):
+    rig, markers = worlds.qcar_rig(), worlds.room_markers()
+    blind = Observation(jnp.full((4, 4, 4, 2), filler), jnp.zeros((4, 4), bool))
+    candidates = find(rig, markers, blind)
+    assert not np.any(candidates.valid)
+    assert not np.any(candidates.converged)
+    assert candidates.cost.dtype == precision
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
+
+
+def test_absurd_corners_are_no_candidate_in_float32():
+    with jax.enable_x64(False):
+        rig, markers, obs = view(worlds.paper_markers(), worlds.START_VIEW)
+        absurd = eqx.tree_at(lambda o: o.corners_px, obs, obs.corners_px * 1e25)
+        candidates = find(rig, markers, absurd)
+        assert not np.any(candidates.valid)
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
+
+
+def test_corners_that_defeat_the_covariance_are_no_candidate():
+    """The best fit is a marker at astronomic distance: finite e1, singular information."""
+    rig, markers, obs = view(worlds.paper_markers(), worlds.START_VIEW)
+    corners = obs.corners_px.at[0, 0, :, 1].set(jnp.asarray([1498.0, 232430.0, 232616.0, 1603.0]))
+    candidates = find(rig, markers, eqx.tree_at(lambda o: o.corners_px, obs, corners))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(candidates))
+    covariances = np.asarray(candidates.covariance)
+    assert np.all(np.diagonal(covariances, axis1=1, axis2=2) > 0)
+
+
+def test_pruning_keeps_what_explains_all_corners_best():
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    every = find(rig, markers, obs, max_candidates=32)
+    for count in (1, 4):
+        few = find(rig, markers, obs, max_candidates=count)
+        assert few.valid.shape == (count,)
+        np.testing.assert_allclose(few.e1_px2[0], every.e1_px2[0], rtol=1e-6)
+        np.testing.assert_allclose(
+            jaxlie.SE3(few.T_vehicle_world.wxyz_xyz[0]).as_matrix(),
+            jaxlie.SE3(every.T_vehicle_world.wxyz_xyz[0]).as_matrix(),
+            atol=1e-6,
+        )
+
+
+@pytest.mark.parametrize("copies", [1, 3], ids=["few lanes", "many"])
+def test_pruning_calls_no_library(copies):
+    """As XLA's TopK: a program that does can't be kept, and is compiled anew at every start."""
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW)
+    markers = MarkerMap(
+        jaxlie.SE3(jnp.tile(markers.Ts_world_marker.wxyz_xyz, (copies, 1))),
+        jnp.tile(markers.size_m, copies),
+        markers.ids * copies,
+        markers.families * copies,
+    )
+    wide = jnp.tile(obs.corners_px, (1, copies, 1, 1)), jnp.tile(obs.visible, (1, copies))
+    obs = eqx.tree_at(lambda o: (o.corners_px, o.visible), obs, wide)
+    assert " top_k[" not in str(jax.make_jaxpr(find)(rig, markers, obs))
+
+
+def test_few_sightings_are_the_largest_ones():
+    """With one slot the pose is that of the largest image alone."""
+    rig, markers, obs = view(worlds.room_markers(), ROOM_VIEW, 0.3)
+    x, y = np.moveaxis(np.asarray(obs.corners_px), -1, 0)
+    area = np.abs(np.sum(x * np.roll(y, -1, -1) - y * np.roll(x, -1, -1), axis=-1))
+    largest = np.unravel_index(np.argmax(np.where(obs.visible, area, 0)), (4, 4))
+    alone = eqx.tree_at(lambda o: o.visible, obs, jnp.zeros_like(obs.visible).at[largest].set(True))
+    pruned = find(rig, markers, obs, max_sightings=1)
+    expected = find(rig, markers, alone, max_sightings=1)
+    assert pruned.valid.shape == (2,)
+    np.testing.assert_array_equal(
+        pruned.T_vehicle_world.wxyz_xyz, expected.T_vehicle_world.wxyz_xyz
+    )
+    spoilt = jnp.where(expected.valid, pruned.e1_px2, 0)
+    assert np.all(np.isfinite(spoilt))
+
+
+GROUND_VIEWS = [worlds.START_VIEW, worlds.OVERLAP_VIEW]
+
+
+@pytest.mark.parametrize("pose", GROUND_VIEWS)
+def test_on_the_ground_only_three_numbers_are_refined(pose, precision):
+    rig, markers, obs = view(worlds.paper_markers(), pose, 0.5, seed=2)
+    free = find(rig, markers, obs)
+    level = find(rig, markers, obs, ground_plane=True)
+    single = precision == np.float32
+    assert level.valid[0]
+    assert level.e1_px2.dtype == precision
+    T = np.asarray(jax.vmap(lambda T: T.inverse().as_matrix())(level.T_vehicle_world))
+    np.testing.assert_allclose(T[:, 2, 3], 0, atol=1e-5 if single else 1e-12)
+    np.testing.assert_allclose(T[:, 2], np.tile([0, 0, 1, 0], (4, 1)), atol=1e-5)
+    # Three numbers can't explain the corners better than six.
+    assert level.e1_px2[0] >= free.e1_px2[0] * (1 - 1e-4)
+    # And what is left is noise.
+    assert level.e1_px2[0] < 8 * 0.5**2 * 8
+    kept = np.asarray(level.covariance)
+    np.testing.assert_array_equal(kept[:, 2:5], 0)
+    np.testing.assert_array_equal(kept[:, :, 2:5], 0)
+    planar = kept[:, [0, 1, 5]][:, :, [0, 1, 5]]
+    assert np.all(np.linalg.eigvalsh(planar) > 0)
+    errors = pose_errors(level, pose)
+    assert errors[np.asarray(level.valid), 0].min() < 0.2
+
+
+@pytest.mark.parametrize("pose", GROUND_VIEWS)
+def test_on_the_ground_the_minimum_is_scipy_s(pose):
+    """Pose, cost and covariance of (x, y, psi) by least squares on the projected pixels."""
+    sigma_px = 0.5
+    rig, markers, obs = view(worlds.paper_markers(), pose, sigma_px, seed=2)
+    level = find(rig, markers, obs, jnp.asarray(sigma_px), ground_plane=True)
+    shown = np.asarray(obs.visible)[:, :, None, None]
+
+    @jax.jit
+    def pixels(planar):
+        T_vehicle_world = worlds.T_world_vehicle_from_planar(planar).inverse()
+        gap = rig.project(T_vehicle_world, markers.corners_world_m) - obs.corners_px
+        return jnp.where(shown, gap, 0).reshape(-1) / sigma_px
+
+    for index in np.flatnonzero(level.valid):
+        T = jaxlie.SE3(level.T_vehicle_world.wxyz_xyz[index]).inverse()
+        found = np.asarray(planar_from_T_world_vehicle(T))
+        solution = scipy.optimize.least_squares(
+            lambda x: np.asarray(pixels(jnp.asarray(x))),
+            found + 0.01, jac="3-point", method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15,
+        )  # fmt: skip
+        np.testing.assert_allclose(found, solution.x, atol=1e-5)
+        assert level.cost[index] == pytest.approx(2 * solution.cost, rel=1e-6)
+        # xi is in the vehicle's axes.
+        c, s = np.cos(found[2]), np.sin(found[2])
+        to_world = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        covariance = np.asarray(level.covariance)[index][np.ix_([0, 1, 5], [0, 1, 5])]
+        expected = np.linalg.inv(solution.jac.T @ solution.jac)
+        sigma = np.sqrt(np.diagonal(expected))
+        scale = np.outer(sigma, sigma)
+        # A weak prior bounds the estimator's covariance.
+        np.testing.assert_allclose(
+            to_world @ covariance @ to_world.T / scale, expected / scale, atol=0.02
+        )
+
+
+@in_float32
+def test_gradients_are_finite(precision):
+    """Through unproject, IPPE, pruning, LM and covariance; a frontal view and none at all."""
+    rig, markers, start = view(worlds.paper_markers(), worlds.START_VIEW)
+    _, _, frontal = view(worlds.paper_markers(), (0.0, -0.4, np.pi / 2))
+    blind = Observation(jnp.zeros_like(start.corners_px), jnp.zeros_like(start.visible))
+
+    @jax.jit
+    @jax.grad
+    def slope(floats, visible):
+        corners_px, focal_px, Ts = floats
+        changed = eqx.tree_at(
+            lambda r: (r.cameras.focal_px, r.Ts_camera_vehicle), rig, (focal_px, jaxlie.SE3(Ts))
+        )
+        candidates = find(changed, markers, Observation(corners_px, visible))
+        leaves = jax.tree.leaves(eqx.filter(candidates, eqx.is_inexact_array))
+        return sum(jnp.sum(leaf) for leaf in leaves)
+
+    for obs in (start, frontal, blind):
+        floats = (obs.corners_px, rig.cameras.focal_px, rig.Ts_camera_vehicle.wxyz_xyz)
+        for leaf in slope(floats, obs.visible):
+            assert leaf.dtype == precision
+            assert np.all(np.isfinite(leaf))

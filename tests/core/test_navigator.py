@@ -1,0 +1,535 @@
+"""Algorithm 1 as one pure step: the same alone, scanned and vmapped; its gradient; bad input."""
+
+import dataclasses
+import functools
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from jaxnav.core.filter.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.models.geometry import planar_from_T_world_vehicle
+from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.navigator import Navigator, Output, State
+from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.sim.regimes import step_by_regime
+from tests import worlds
+from tests.derivatives import check_derivatives, in_float32
+from tests.reference import kalman, paper
+
+WHEELBASE_M = 0.256
+DT_S = 0.1
+STEPS = 20
+START = (1.2, -0.6, np.deg2rad(135.0))
+SPEED_MPS, STEERING_RAD = 0.25, 0.12
+
+
+def navigator(**options) -> Navigator:
+    """The paper's rule, unless told otherwise: the bank has tests of its own."""
+    options = {"selector": PaperCost(), "waypoints_m": worlds.WAYPOINTS_M} | options
+    return Navigator(
+        rig=worlds.qcar_rig(),
+        markers=worlds.paper_markers(),
+        vehicle=worlds.qcar(),
+        **options,
+    )
+
+
+def true_poses() -> np.ndarray:
+    """(STEPS, 3): the car at constant speed and steering."""
+    poses = paper.drive(START, SPEED_MPS, STEERING_RAD, STEPS * DT_S, WHEELBASE_M, STEPS * 50)
+    return poses[:-1:50]
+
+
+def drive(sigma_px: float = 0.2, seed: int = 0, blind: tuple[int, ...] = ()) -> Observation:
+    """What the car senses on the way, leading axis (STEPS,)."""
+    rig, markers = worlds.qcar_rig(), worlds.paper_markers()
+    noise = sigma_px * np.random.default_rng(seed).standard_normal((STEPS, 4, 1, 4, 2))
+    sees = np.ones(STEPS, bool)
+    sees[list(blind)] = False
+
+    return look(rig, markers, *map(jnp.asarray, (true_poses(), noise, sees)))
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
+def look(rig: CameraRig, markers: MarkerMap, pose, noise, sees) -> Observation:
+    T_world_vehicle = worlds.T_world_vehicle_from_planar(pose)
+    odometry = {"speed_mps": SPEED_MPS, "steering_rad": STEERING_RAD, "dt_s": DT_S}
+    obs = worlds.observe(rig, markers, T_world_vehicle, noise, **odometry)
+    return eqx.tree_at(lambda o: o.visible, obs, obs.visible & sees)
+
+
+def at(tree, index):
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def floats_of(tree):
+    return jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array))
+
+
+step = jax.jit(lambda navigator, state, obs: navigator.step(state, obs))
+scan = jax.jit(lambda navigator, state, obs: jax.lax.scan(navigator.step, state, obs))
+
+
+def step_by_step(nav: Navigator, obs: Observation) -> tuple[State, Output]:
+    state, outputs = nav.init(), []
+    for index in range(STEPS):
+        state, out = step(nav, state, at(obs, index))
+        outputs.append(out)
+    return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs)
+
+
+def test_step_scan_and_vmap_agree():
+    """Everything a user reads; of a lane that no one takes as much as LM's stopping rule leaves."""
+    nav = navigator()
+    drives = [drive(seed=seed, blind=(7, 8)) for seed in range(2)]
+    alone = [step_by_step(nav, obs) for obs in drives]
+    scanned = [scan(nav, nav.init(), obs) for obs in drives]
+    mapped = jax.jit(jax.vmap(lambda obs: jax.lax.scan(nav.step, nav.init(), obs)))(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *drives)
+    )
+
+    def told(result):
+        state, out = result
+        return (
+            state, out.pose, out.covariance, out.command, out.done, out.selected,
+            out.T_world_vehicle,
+        )  # fmt: skip
+
+    def of_all_lanes(out):
+        costs = jnp.where(out.candidates.valid, out.costs, 0)
+        return jnp.append(costs.reshape(-1), out.flip_probability)
+
+    for index in range(2):
+        expected = jax.tree.leaves(told(alone[index]))
+        for other in (scanned[index], at(mapped, index)):
+            for leaf, value in zip(jax.tree.leaves(told(other)), expected, strict=True):
+                np.testing.assert_allclose(leaf, value, rtol=1e-7, atol=1e-7)
+            np.testing.assert_allclose(
+                of_all_lanes(other[1]),
+                of_all_lanes(alone[index][1]),
+                rtol=1e-5,
+                atol=1e-6,
+            )
+
+
+@in_float32
+def test_the_bound_step_can_be_jitted_and_is_traced_once_a_drive(precision, monkeypatch):
+    nav, readings, traces = navigator(), drive(blind=(3,)), []
+    step_of = Navigator.step
+    monkeypatch.setattr(Navigator, "step", lambda *given: traces.append(None) or step_of(*given))
+    jitted = jax.jit(nav.step)
+    obs = at(readings, 0)
+    state, out = jitted(nav.init(), obs)
+    later = state
+    for index in range(1, 6):
+        later, _ = jitted(later, at(readings, index))
+    assert len(traces) == 1
+    assert jitted._cache_size() == 1
+    monkeypatch.undo()
+    _, expected = step(nav, nav.init(), obs)
+    np.testing.assert_allclose(out.pose, expected.pose, atol=1e-4)
+    assert nav.step == nav.step
+    for leaf in floats_of((state, out)):
+        assert leaf.dtype == precision
+
+
+def test_the_car_is_located_in_both_precisions():
+    outputs = {}
+    for precision in ("float32", "float64"):
+        with jax.enable_x64(precision == "float64"):
+            nav = navigator()
+            state, out = scan(nav, nav.init(), drive())
+            assert {leaf.dtype for leaf in floats_of((state, out))} == {np.dtype(precision)}
+            assert np.all(out.located)
+            outputs[precision] = np.asarray(out.pose, float), np.asarray(out.command.steering_rad)
+    np.testing.assert_allclose(outputs["float32"][0], outputs["float64"][0], atol=3e-3)
+    np.testing.assert_allclose(outputs["float32"][1], outputs["float64"][1], atol=5e-3)
+    errors = outputs["float64"][0] - true_poses()
+    assert np.max(np.abs(errors[-5:, :2])) < 0.05
+    assert np.max(np.abs(errors[-5:, 2])) < 0.03
+
+
+def reference_pose_covariance(nav: Navigator, pose, sigma_px: float) -> np.ndarray:
+    """Covariance of (x, y, psi) at a pose from the pixels' derivatives: equations and loops."""
+    rig, corners = nav.rig, np.asarray(nav.markers.corners_world_m)[0]
+    visible = np.asarray(worlds.observe(rig, nav.markers, worlds.planar(*pose)).visible)[:, 0]
+    T_world_vehicle = np.asarray(worlds.planar(*pose).as_matrix())
+
+    def pixels(xi):
+        T_vehicle_world = np.linalg.inv(
+            T_world_vehicle @ np.asarray(jaxlie.SE3.exp(jnp.asarray(xi)).as_matrix())
+        )
+        seen = []
+        for j in np.flatnonzero(visible):
+            camera = rig.camera(int(j))
+            T_camera_vehicle = np.asarray(rig.Ts_camera_vehicle.as_matrix())[j]
+            for corner in corners:
+                p = T_camera_vehicle @ T_vehicle_world @ np.append(corner, 1)
+                K = np.asarray(camera.K)
+                seen.append(paper.project(K, "equidistant", np.asarray(camera.distortion), p[:3]))
+        return np.ravel(seen)
+
+    h = 1e-5
+    J = np.stack([(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(6)], axis=1)
+    P = np.linalg.inv(J.T @ J / sigma_px**2)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    to_planar = np.zeros((3, 6))
+    to_planar[:2, :2] = [[c, -s], [s, c]]
+    to_planar[2, 5] = 1
+    return to_planar @ P @ to_planar.T
+
+
+def test_the_first_two_steps_by_hand():
+    """Pose and covariance from the pixels, the filter's and the controller's equations."""
+    truth = true_poses()
+    # Ahead and far enough: on a waypoint inside the smallest circle the controller turns no wheel.
+    direction = truth[0, 2] + np.deg2rad(20.0)
+    waypoint = truth[0, :2] + 3.0 * np.array([np.cos(direction), np.sin(direction)])
+    nav = navigator(corner_sigma_px=0.25, waypoints_m=[waypoint.tolist(), (0.5, 0.65)])
+    motion = nav.motion
+    obs = drive(sigma_px=0.0)
+    state, out = step(nav, nav.init(), at(obs, 0))
+    floor = np.diag(np.asarray(motion.vision_floor) ** 2)
+    noise = (WHEELBASE_M, np.asarray(motion.odometry_sigma))
+
+    x = np.append(truth[0], np.zeros(3))
+    P = np.zeros((6, 6))
+    P[:3, :3] = reference_pose_covariance(nav, truth[0], 0.25) + floor
+    P[3:, 3:] = np.diag(np.asarray(motion.initial_velocity_sigma) ** 2)
+    x, P, _ = kalman.update(x, P, None, None, SPEED_MPS, STEERING_RAD, *noise)
+    np.testing.assert_allclose(state.belief.bank.mean[0], x, atol=2e-4)
+    np.testing.assert_allclose(out.covariance, P, rtol=0.02, atol=1e-6)
+    assert out.nis == 0
+    assert out.flip_probability < 0.5
+
+    angle, distance, _ = paper.steering(out.pose, waypoint, STEERING_RAD, WHEELBASE_M)
+    assert abs(angle) < 0.5
+    assert out.command.steering_rad == pytest.approx(angle, abs=1e-9)
+    gains = nav.controller
+    throttle = (gains.proportional_per_m + gains.integral_per_ms * DT_S) * distance
+    assert out.command.throttle == pytest.approx(float(throttle))
+
+    state, out = step(nav, state, at(obs, 1))
+    told = SPEED_MPS, STEERING_RAD, WHEELBASE_M
+    x, P = kalman.predict(x, P, DT_S, np.asarray(motion.acceleration_density), told)
+    R_pose = reference_pose_covariance(nav, truth[1], 0.25) + floor
+    x, P, nis = kalman.update(x, P, truth[1], R_pose, SPEED_MPS, STEERING_RAD, *noise)
+    np.testing.assert_allclose(state.belief.bank.mean[0], x, atol=2e-3)
+    np.testing.assert_allclose(out.covariance, P, rtol=0.05, atol=1e-5)
+    np.testing.assert_allclose(out.nis, nis, atol=0.02)
+
+
+def test_without_a_marker_odometry_carries_on():
+    nav = navigator()
+    _, out = scan(nav, nav.init(), drive(blind=tuple(range(8, STEPS))))
+    blind = np.arange(STEPS) >= 8
+    np.testing.assert_array_equal(np.asarray(out.selected) == -1, blind)
+    np.testing.assert_array_equal(np.asarray(out.nis)[blind], 0)
+    assert np.all(out.located)
+    # The volume grows. The position's part alone may shrink: it swings about the marker with the
+    # heading, and the car drives towards the marker.
+    volumes = np.linalg.slogdet(np.asarray(out.covariance)[:, :3, :3])[1]
+    assert np.all(np.diff(volumes[8:]) > 0)
+    errors = np.asarray(out.pose) - true_poses()
+    assert np.max(np.abs(errors[-1, :2])) < 0.1
+    assert np.all(np.asarray(out.command.throttle) > 0)
+
+
+def test_never_located_never_drives():
+    nav = navigator()
+    state, out = scan(nav, nav.init(), drive(blind=tuple(range(STEPS))))
+    assert not np.any(out.located)
+    assert not np.any(out.command.throttle)
+    assert not np.any(out.command.steering_rad)
+    assert all(np.all(np.isfinite(leaf)) for leaf in floats_of(state))
+
+
+@pytest.fixture(scope="module")
+def located():
+    nav = navigator()
+    obs = at(drive(), 0)
+    state, _ = step(nav, nav.init(), obs)
+    return nav, state, obs
+
+
+ANYTHING = st.floats(allow_nan=True, allow_infinity=True)
+
+
+@settings(max_examples=150)
+@example((9.35e155, 1.0, 0.0), [None] * 7 + [1.3407807929942597e154])
+@example((0.0, 0.0, 0.0), [None, 1498.0, None, 232430.0, None, 232616.0, None, 1603.0])
+@given(
+    st.tuples(*[ANYTHING] * 3), st.lists(st.one_of(st.just(None), ANYTHING), min_size=8, max_size=8)
+)
+def test_state_and_command_survive_any_reading(located, odometry, corners):
+    nav, state, obs = located
+    spoilt = np.array(obs.corners_px)
+    visible = np.flatnonzero(obs.visible[:, 0])[0]
+    flat = spoilt[visible, 0].reshape(8)
+    for index, value in enumerate(corners):
+        flat[index] = flat[index] if value is None else value
+    readings = (jnp.asarray(value, float) for value in odometry)
+    state, out = step(
+        nav,
+        state,
+        eqx.tree_at(
+            lambda o: (o.corners_px, o.speed_mps, o.steering_rad, o.dt_s),
+            obs,
+            (jnp.asarray(spoilt), *readings),
+        ),
+    )
+    check_contained(state, out)
+    # And it finds back.
+    for _ in range(2):
+        state, out = step(nav, state, obs)
+    check_contained(state, out)
+
+
+def check_contained(state: State, out: Output) -> None:
+    assert all(np.all(np.isfinite(leaf)) for leaf in floats_of(state))
+    told = (out.pose, out.covariance, out.T_world_vehicle, out.command, out.candidates, out.nis)
+    assert all(np.all(np.isfinite(leaf)) for leaf in floats_of(told))
+    assert abs(float(out.command.steering_rad)) <= 0.5
+    assert abs(float(out.command.throttle)) <= 0.3
+
+
+BROKEN = [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e10]
+
+
+@pytest.mark.parametrize("field", ["speed_mps", "steering_rad", "dt_s", "corners_px"])
+def test_broken_readings_are_contained(precision, field):
+    nav = navigator()
+    obs = at(drive(), 0)
+    located, _ = step(nav, nav.init(), obs)
+    for value in BROKEN:
+        where = (lambda o: o.corners_px) if field == "corners_px" else lambda o: getattr(o, field)
+        bad = eqx.tree_at(where, obs, jnp.full_like(where(obs), value))
+        state, out = step(nav, located, bad)
+        check_contained(state, out)
+        if field == "corners_px" and not np.isfinite(value):
+            assert int(out.selected) == -1
+        state, out = step(nav, state, obs)
+        check_contained(state, out)
+        assert out.located
+
+
+def test_nan_odometry_is_a_step_without_odometry(located):
+    nav, state, obs = located
+    absent = eqx.tree_at(
+        lambda o: o.has_odometry, obs, jnp.asarray(False), is_leaf=lambda x: x is True
+    )
+    expected, _ = step(nav, state, absent)
+    for field in ("speed_mps", "steering_rad"):
+        broken = eqx.tree_at(lambda o, f=field: getattr(o, f), obs, jnp.asarray(jnp.nan, float))
+        actual, _ = step(nav, state, broken)
+        np.testing.assert_array_equal(actual.belief.bank.mean, expected.belief.bank.mean)
+        np.testing.assert_array_equal(
+            actual.belief.bank.covariance, expected.belief.bank.covariance
+        )
+
+
+def parameters_of(nav: Navigator) -> dict[str, jax.Array]:
+    """Motion noise and gains: what a tuner varies."""
+    motion, controller = nav.motion, nav.controller
+    return {
+        "acceleration_density": motion.acceleration_density,
+        "corner_sigma_px": nav.corner_sigma_px,
+        "integral_per_ms": controller.integral_per_ms,
+        "odometry_sigma": motion.odometry_sigma,
+        "proportional_per_m": controller.proportional_per_m,
+        "vision_floor": motion.vision_floor,
+    }
+
+
+def tuned(nav: Navigator, parameters: dict[str, jax.Array]) -> Navigator:
+    """The navigator with these parameters in place of its own."""
+    return eqx.tree_at(
+        lambda n: [parameters_of(n)[key] for key in sorted(parameters)],
+        nav,
+        [parameters[key] for key in sorted(parameters)],
+    )
+
+
+def test_derivatives_of_a_step():
+    """With respect to corners, odometry, interval, motion noise and gains: three ways."""
+    nav = navigator(max_lm_steps=40)
+    obs = drive()
+    state, _ = step(navigator(), nav.init(), at(obs, 0))
+    second = at(obs, 1)
+
+    def outcome(corners_px, speed_mps, steering_rad, dt_s, parameters):
+        changed = Observation(corners_px, second.visible, speed_mps, steering_rad, dt_s)
+        after, out = tuned(nav, parameters).step(state, changed)
+        return after.belief.bank.mean, after.belief.bank.covariance, out.command
+
+    arguments = (second.corners_px, second.speed_mps, second.steering_rad, second.dt_s)
+    check_derivatives(outcome, *arguments, parameters_of(nav), step=1e-6, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.long
+@in_float32
+def test_a_rollout_of_20_steps_has_a_finite_gradient(precision):
+    """With respect to the filter's noise and the gains, through frames without a marker."""
+    nav = navigator()
+    obs = drive(blind=(5, 6, 7))
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(parameters):
+        changed = tuned(nav, parameters)
+        _, out = jax.lax.scan(changed.step, changed.init(), obs)
+        error = out.pose - jnp.asarray(true_poses())
+        return jnp.sum(error**2) + jnp.sum(out.command.throttle**2) + jnp.sum(out.nis)
+
+    value, gradient = loss(parameters_of(nav))
+    assert np.isfinite(value)
+    for name, leaf in gradient.items():
+        assert leaf.dtype == precision
+        assert np.all(np.isfinite(leaf)), name
+        assert np.all(leaf != 0), name
+
+
+class EachItsOwn(eqx.Module):
+    """A toy bank: hypothesis k takes candidate k, and weighs what that leaves unexplained."""
+
+    hypotheses: ClassVar[int] = 2
+
+    def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
+        del snapshot
+        valid, cost = candidates.valid[:2], candidates.cost[:2]
+        Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(candidates.T_vehicle_world)
+        log_weight = prior.log_weight - jnp.where(valid, cost, 20.0) / 2
+        return Selection(
+            measured=PoseMeasurement(
+                jaxlie.SE3(Ts_world_vehicle.wxyz_xyz[:2]),
+                candidates.covariance[:2],
+                jnp.where(valid, -cost / 2, 0),
+                valid,
+            ),
+            kept=prior.initialised,
+            log_weight=log_weight,
+            heir=jnp.arange(2),
+            costs=jnp.where(candidates.valid, candidates.cost, jnp.inf),
+            selected=jnp.where(jnp.any(valid), jnp.argmax(log_weight), -1),
+            flip_probability=jnp.asarray(0.5),
+            decided=jnp.asarray(True),
+        )
+
+
+by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(step_by_regime(nav), state, obs))
+
+
+def spanning(bank):
+    """The bank with one hypothesis, at the mirrored pose, too wide to know."""
+    out = step(navigator(), navigator().init(), at(drive(), 0))[1]
+    Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(out.candidates.T_vehicle_world)
+    poses = np.asarray(planar_from_T_world_vehicle(Ts_world_vehicle))
+    gaps = np.linalg.norm(poses[:2] - true_poses()[0], axis=1)
+    wrong, apart = poses[np.argmax(gaps)], poses[0] - poses[1]
+    return dataclasses.replace(
+        bank,
+        mean=bank.mean.at[0, :3].set(wrong),
+        covariance=bank.covariance.at[0, :3, :3].set(jnp.diag(apart**2 + 0.5**2)),
+        initialised=bank.initialised.at[0].set(True),
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("start", ["empty", "one that spans both poses"])
+def test_step_by_regime_is_step(start):
+    """A start with the whole bank, a few hypotheses, one; one sighting, two and none."""
+    nav = navigator(selector=MultiHypothesis(hypotheses=12), max_sightings=2)
+    obs = drive(sigma_px=1.0, blind=(STEPS - 2,))
+    begin = nav.init()
+    if start != "empty":
+        begin = eqx.tree_at(lambda s: s.belief.bank, begin, spanning(begin.belief.bank))
+    state, out = scan(nav, begin, obs)
+    _, same = by_regime(nav, begin, obs)
+    bank = state.belief.bank
+    assert int(np.sum(bank.initialised)) < 8
+    if start != "empty":
+        assert int(out.hypothesis[0]) == 0  # the mirrored one
+        assert int(out.hypothesis[-1]) > 0
+    for name in ("selected", "hypothesis", "decided", "located", "done"):
+        np.testing.assert_array_equal(getattr(same, name), getattr(out, name))
+    for name in ("pose", "covariance", "flip_probability", "nis", "command"):
+        for a, b in zip(*(jax.tree.leaves(getattr(o, name)) for o in (same, out)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8)
+
+
+def test_more_hypotheses_need_no_change_to_step():
+    """K = 2 through the same step: the reported pose is that of the heavier one."""
+    nav = navigator(selector=EachItsOwn())
+    assert nav.init().belief.bank.mean.shape == (2, 6)
+    state, out = scan(nav, nav.init(), drive(sigma_px=0.3))
+    assert state.belief.bank.mean.shape == (2, 6)
+    assert out.nis.shape == (STEPS,)
+    heavier = int(np.argmax(state.belief.bank.log_weight))
+    assert int(out.hypothesis[-1]) == heavier
+    np.testing.assert_allclose(out.pose[-1], state.belief.bank.mean[heavier, :3], atol=1e-12)
+    share = np.exp(np.asarray(state.belief.bank.log_weight))
+    means = np.asarray(state.belief.bank.mean)
+    apart = means - means[heavier]
+    apart[:, 2] = kalman.wrap(apart[:, 2])
+    spread = np.asarray(state.belief.bank.covariance) + np.einsum("id,ie->ide", apart, apart)
+    expected = np.einsum("i,ide->de", share / share.sum(), spread)
+    np.testing.assert_allclose(out.covariance[-1], expected, atol=1e-12)
+    assert not np.allclose(state.belief.bank.mean[0], state.belief.bank.mean[1], atol=0.01)
+    assert abs(float(state.belief.bank.log_weight[0] - state.belief.bank.log_weight[1])) > 1
+
+
+def test_it_locates_a_hand_held_rig_without_a_route():
+    """Constant velocity on SE(3), six degrees of freedom, no command."""
+    rig, markers = worlds.handheld_rig(), worlds.room_markers()
+    nav = Navigator(rig=rig, markers=markers, corner_sigma_px=0.3)
+    rng = np.random.default_rng(1)
+    upright = jaxlie.SE3.from_rotation(jaxlie.SO3.from_x_radians(jnp.asarray(-np.pi / 2)))
+    T = worlds.planar(0.2, 0.1, 0.6) @ upright
+    twist = jnp.asarray([0.2, -0.05, 0.1, 0.1, 0.4, -0.1])
+    look = jax.jit(lambda T, n: worlds.observe(rig, markers, T, n, dt_s=0.05))
+    state = nav.init()
+    for _ in range(15):
+        T = T @ jaxlie.SE3.exp(twist * 0.05)
+        noise = jnp.asarray(0.3 * rng.standard_normal((4, 4, 4, 2)))
+        state, out = step(nav, state, look(T, noise))
+    assert out.command is None
+    assert not out.done
+    assert out.covariance.shape == (12, 12)
+    error = (out.T_world_vehicle.inverse() @ T).log()
+    assert np.linalg.norm(error[:3]) < 0.01
+    assert np.linalg.norm(error[3:]) < 0.01
+    # 6 degrees of freedom and the floor
+    assert 0 < float(out.nis) < 30
+
+
+def test_what_cannot_be_built_is_told():
+    rig, markers = worlds.qcar_rig(), worlds.paper_markers()
+    with pytest.raises(ValueError, match="needs a vehicle"):
+        Navigator(rig=rig, markers=markers, waypoints_m=[(1.0, 0.0)])
+    with pytest.raises(ValueError, match=r"\(W, 2\)"):
+        Navigator(rig=rig, markers=markers, vehicle=worlds.qcar(), waypoints_m=[(1.0, 0.0, 0.0)])
+
+
+def test_the_marker_is_where_the_corners_say():
+    """The first output of a noise-free frame projects the marker onto its corners."""
+    nav, obs = navigator(), at(drive(sigma_px=0.0), 0)
+    _, out = step(nav, nav.init(), obs)
+    assert CORNER_SIGNS.shape == (4, 3)
+    pixels = nav.rig.project(
+        worlds.planar(*np.asarray(out.pose)).inverse(), nav.markers.corners_world_m
+    )
+    visible = np.asarray(obs.visible)
+    np.testing.assert_allclose(
+        np.asarray(pixels)[visible], np.asarray(obs.corners_px)[visible], atol=1e-3
+    )

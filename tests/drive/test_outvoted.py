@@ -1,0 +1,193 @@
+"""A marker that others have outvoted does not count while it is alone in view, nor does an id that
+two cameras see at two places."""
+
+import dataclasses
+
+import jaxlie
+import numpy as np
+import pytest
+
+from jaxnav.core.filter.selectors import make_selector
+from jaxnav.core.navigator import Navigator
+from jaxnav.drive.chassis import Motion
+from jaxnav.drive.history import EventData
+from jaxnav.drive.outvoted import MarkerVotes, Twins
+from jaxnav.drive.standstill import Way
+from tests import worlds
+
+IDS = (7, 3, 12)
+
+
+def told(*in_view: int, count: int = len(IDS)) -> EventData:
+    visible = np.zeros((2, count), bool)
+    visible[0, list(in_view)] = True
+    return EventData(
+        corners_px=np.zeros((2, count, 4, 2)), visible=visible, sigma_px=np.ones((2, count, 4))
+    )
+
+
+def voted(*which: int) -> np.ndarray:
+    return np.isin(np.arange(3), which)
+
+
+def test_one_that_was_outvoted_often_is_hidden_where_too_few_are_in_view_to_vote():
+    votes, alone = MarkerVotes(IDS), told(2)
+    assert votes.outvoted == ()
+    for _ in range(10):
+        assert votes.remove_outvoted(alone) is alone
+        votes.count(told(0, 1, 2), voted(2))
+        assert votes.outvoted == (12,)
+    assert votes.remove_outvoted(alone) is None
+    left = votes.remove_outvoted(told(0, 2))
+    np.testing.assert_array_equal(left.visible.any(axis=0), [True, False, False])
+    everything = told(0, 1, 2)
+    assert votes.remove_outvoted(everything) is everything
+
+
+def test_it_stays_named_while_others_are_in_view_or_none():
+    votes = MarkerVotes(IDS)
+    votes.count(told(0, 1, 2), voted(2))
+    for seen in (told(0, 1), told(2), told()):
+        votes.count(seen, voted())
+        assert votes.outvoted == (12,)
+    votes.count(told(0, 1, 2), voted())
+    assert votes.outvoted == ()
+
+
+def test_one_that_agrees_again_is_believed_again():
+    votes, alone = MarkerVotes(IDS), told(0)
+    for _ in range(100):
+        votes.count(told(0, 1, 2), voted(0))
+    for _ in range(11):
+        assert votes.remove_outvoted(alone) is None
+        votes.count(told(0, 1, 2), voted())
+    assert votes.remove_outvoted(alone) is alone
+
+
+@pytest.mark.parametrize("ids", [(0,), (0, 1)])
+def test_maps_too_small_to_vote_hide_nothing(ids):
+    votes = MarkerVotes(ids)
+    seen = told(*range(len(ids)), count=len(ids))
+    for _ in range(50):
+        votes.count(seen, np.ones(len(ids), bool))
+    assert votes.outvoted == ()
+    assert votes.remove_outvoted(seen) is seen
+
+
+def test_frames_that_show_too_few_do_not_count():
+    votes, alone = MarkerVotes(IDS), told(0)
+    for _ in range(50):
+        votes.count(told(0, 1), voted(0))
+    assert votes.outvoted == ()
+    assert votes.remove_outvoted(alone) is alone
+
+
+MS = 1_000_000
+RIG, MARKERS = worlds.qcar_rig(), worlds.paper_markers()
+TURN_M = (2.0, -1.6, np.pi)  # brings a copy behind the vehicle at its start
+ELSEWHERE = worlds.planar(*TURN_M).inverse()  # whoever sees the copy there sees the marker here
+
+
+def twins(rig=RIG) -> Twins:
+    selector = make_selector("paper-cost")
+    return Twins(Navigator(rig=rig, markers=MARKERS, vehicle=worlds.qcar(), selector=selector))
+
+
+def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int = 0) -> EventData:
+    """What the cameras see from (x_m, y_m, psi_rad), some of them of the copy alone."""
+    rng, T = np.random.default_rng(seed), worlds.planar(*place)
+    truth, copy = worlds.observe(RIG, MARKERS, T), worlds.observe(RIG, MARKERS, ELSEWHERE @ T)
+    of_copy = np.isin(np.arange(4), of_copy)[:, None]
+    visible = np.where(of_copy, copy.visible, truth.visible)
+    visible = visible & np.isin(np.arange(4), list(cameras))[:, None]
+    corners_px = np.where(of_copy[:, :, None, None], copy.corners_px, truth.corners_px)
+    corners_px = corners_px + noise_px * rng.standard_normal(corners_px.shape)
+    return EventData(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
+
+
+def standing(until_ns: int) -> Way:
+    way = Way()
+    for stamp_ns in range(0, until_ns + 1, 20 * MS):
+        way.go(stamp_ns, Motion(0.0, 0.0, 0.0))
+    return way
+
+
+def test_one_id_in_two_cameras_at_two_places_is_left_out_from_the_first_frame():
+    watch, way = twins(), standing(400 * MS)
+    both = views(worlds.START_VIEW, of_copy=[2])
+    assert both.visible[:, 0].tolist() == [True, False, True, False]
+    assert watch.remove_twins(both, 20 * MS, way) is None
+    assert watch.seen(20 * MS)
+    # For a while it is not believed of one of them either.
+    alone = views(worlds.START_VIEW, cameras=[0])
+    assert watch.remove_twins(alone, 400 * MS, way) is None
+    assert not watch.seen(2_000 * MS)
+
+
+def test_what_was_contradicted_often_comes_back_when_cameras_agree():
+    watch, way = twins(), standing(1_000 * MS)
+    for frame in range(8):
+        assert watch.remove_twins(views(worlds.START_VIEW, of_copy=[2]), 20 * MS, way) is None, (
+            frame
+        )
+    alone, shared = views(worlds.START_VIEW, cameras=[0]), views(worlds.OVERLAP_VIEW)
+    assert watch.remove_twins(alone, 10_000 * MS, way) is None
+    assert watch.seen(10_000 * MS)
+    for _ in range(20):
+        watch.remove_twins(shared, 11_000 * MS, way)
+    assert watch.remove_twins(alone, 12_000 * MS, way) is alone
+
+
+def test_cameras_that_look_in_turn_are_compared_along_the_way():
+    """The vehicle turns between two looks by far more than cameras may differ."""
+    way, rate_radps = Way(), 3.0
+    for stamp_ns in range(0, 201 * MS, 20 * MS):
+        way.go(stamp_ns, Motion(0.0, 0.0, rate_radps))
+    x_m, y_m, psi_rad = worlds.OVERLAP_VIEW
+    later = x_m, y_m, psi_rad + 0.2 * rate_radps
+    first, second = views((x_m, y_m, psi_rad), cameras=[3]), views(later, cameras=[0])
+    assert first.visible.any()
+    assert second.visible.any()
+    watch = twins()
+    watch.remove_twins(first, 0, way)
+    assert watch.remove_twins(second, 200 * MS, way) is second
+    watch = twins()
+    watch.remove_twins(first, 0, standing(400 * MS))
+    # That may be a vehicle that was carried off.
+    assert watch.remove_twins(second, 200 * MS, standing(400 * MS)) is second
+    assert watch.remove_twins(second, 300 * MS, standing(400 * MS)) is second
+    assert not watch.seen(300 * MS)
+    assert watch.remove_twins(first, 400 * MS, standing(400 * MS)) is None
+    # Without an odometer nothing is known of the way between.
+    watch = twins()
+    watch.remove_twins(first, 0, Way())
+    assert watch.remove_twins(second, 200 * MS, Way()) is second
+
+
+@pytest.mark.parametrize("noise_px", [0.3, 2.0])
+def test_what_calibration_and_noise_allow_is_one_place(noise_px):
+    """Cameras off by 1 deg and 1 cm, and each of them by 8 deg, wherever two see the marker."""
+    rng, seen = np.random.default_rng(0), 0
+    for draw in range(40):
+        by_rad = np.deg2rad(8.0 if draw % 2 else 1.0)
+        direction = rng.standard_normal((4, 2, 3))
+        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+        camera = np.arange(4) == draw % 4 if draw % 2 else np.ones(4)
+        xi = np.concatenate([0.01 * direction[:, 0], by_rad * direction[:, 1]], axis=1)
+        Ts = RIG.Ts_camera_vehicle @ jaxlie.SE3.exp(xi * camera[:, None])
+        watch = twins(dataclasses.replace(RIG, Ts_camera_vehicle=Ts))
+        for look in range(25):
+            x_m, y_m = rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 0.6)
+            told = views((x_m, y_m, rng.uniform(-np.pi, np.pi)), noise_px=noise_px, seed=look)
+            if told.visible.sum() > 1:
+                watch.remove_twins(told, look * 10_000 * MS, Way())
+                assert not watch.seen(look * 10_000 * MS)
+                seen += 1
+    assert seen > 200
+
+
+def test_what_a_sure_estimate_judges_is_left_to_it():
+    watch, way, both = twins(), standing(40 * MS), views(worlds.START_VIEW, of_copy=[2])
+    assert watch.remove_twins(both, 20 * MS, way, judged=True) is both
+    assert not watch.seen(20 * MS)
+    assert watch.remove_twins(both, 20 * MS, way) is None

@@ -1,0 +1,198 @@
+"""A rig that moves freely, its messages in any order, against one step after the other."""
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace as Named
+
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+import pytest
+
+from jaxnav.core.filter.ambiguity import LowestReprojection
+from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.pose.observation import Observation
+from jaxnav.detection.types import Detections
+from jaxnav.files.poses import compose, inverse
+from jaxnav.recordings.ros.body import BodyTracker
+from jaxnav.recordings.ros.odometry_track import GrowingTrack
+from jaxnav.vehicles.ros.odom_frame import IDENTITY, OdomPose
+from tests import worlds
+
+TIMES_S = np.arange(0.0, 1.5, 0.1)
+UNSEEN = slice(5, 12)  # frames without a marker
+TWIST = jnp.asarray([0.2, 0.05, 0.0, 0.0, 0.1, 0.2])
+T_VEHICLE_SENSOR = jaxlie.SE3.exp(jnp.asarray([0.1, -0.2, 0.05, 0.5, 1.0, -0.3]))
+T_MAP_ODOM = jaxlie.SE3.exp(jnp.asarray([3.0, 1.0, -2.0, 0.1, 0.4, 2.0]))
+
+
+@pytest.fixture(scope="module")
+def navigator() -> Navigator:
+    return Navigator(
+        worlds.qcar_rig(),
+        worlds.paper_markers(),
+        selector=LowestReprojection(),
+        motion=ConstantVelocity(),
+        corner_sigma_px=0.3,
+    )
+
+
+@pytest.fixture(scope="module")
+def stepped(navigator):
+    return jax.jit(navigator.step)
+
+
+@pytest.fixture(scope="module")
+def frames(navigator) -> list[Observation]:
+    """What the rig sees on its way, at first and in the end."""
+    T = worlds.planar(*worlds.FRONT_VIEW)
+    seen = [
+        worlds.observe(navigator.rig, navigator.markers, T @ jaxlie.SE3.exp(TWIST * t))
+        for t in TIMES_S
+    ]
+    assert all(bool(jnp.any(obs.visible)) for obs in seen)
+    return seen
+
+
+def detections(obs: Observation, camera: int) -> Detections:
+    count = int(obs.visible[camera, 0])
+    return Detections(
+        np.zeros(count, int),
+        np.asarray(obs.corners_px, float)[camera, :count],
+        np.full((count, 4), 0.3),
+        np.ones(count, bool),
+        ("tag36h11",) * count,
+    )
+
+
+def odometry() -> list[tuple[int, np.ndarray]]:
+    """Stamps and T_odom_sensor of the rig's way at 50 Hz, in a frame of its own."""
+    return [
+        (
+            round(t * 1e9),
+            np.asarray((T_MAP_ODOM @ jaxlie.SE3.exp(TWIST * t) @ T_VEHICLE_SENSOR).wxyz_xyz),
+        )
+        for t in np.arange(0.0, TIMES_S[-1] + 0.02, 0.02)
+    ]
+
+
+def test_what_comes_in_any_order_is_taken_in_the_order_of_its_stamps(navigator, frames):
+    cameras = len(navigator.rig)
+    blind = dict.fromkeys(range(len(frames))[UNSEEN])
+    track = GrowingTrack(np.asarray(T_VEHICLE_SENSOR.wxyz_xyz))
+    step, reports = jax.jit(navigator.step), []
+    tracker = BodyTracker(navigator, step, cameras, reports.append, track)
+    tracker.warm_up()
+    messages = [
+        (index, round(TIMES_S[index] * 1e9), camera)
+        for index in range(len(frames))
+        for camera in reversed(range(cameras))
+    ]
+    nothing = Detections.concatenate([])
+    for index, stamp_ns, camera in messages:
+        seen = nothing if index in blind else detections(frames[index], camera)
+        tracker.add(camera, stamp_ns, seen)
+    tracker.start()
+    for stamp_ns, pose in odometry():  # it comes last, and is waited for
+        tracker.add_odometry(stamp_ns, pose)
+    until_s = time.monotonic() + 30
+    while len(reports) < len(frames) and time.monotonic() < until_s:
+        time.sleep(0.01)
+    tracker.close()
+    assert tracker.late == 0
+    assert [report.now_ns for report in reports] == [round(t * 1e9) for t in TIMES_S]
+    state = navigator.init()
+    for index, report in enumerate(reports):
+        obs = frames[index]
+        hidden = jnp.zeros_like(obs.visible) if index in blind else obs.visible
+        obs = Observation(
+            jnp.where(hidden[..., None, None], obs.corners_px, 0),
+            hidden,
+            dt_s=jnp.asarray(0.1 if index else 0.0),
+            twist=jnp.where(index > 0, TWIST, jnp.nan),
+        )
+        state, out = step(state, obs)
+        expected = np.asarray(out.T_world_vehicle.wxyz_xyz, float)
+        np.testing.assert_allclose(report.T_map_base, expected, atol=1e-6)
+
+
+class Alone:
+    """A tracker without a thread, its step that of the navigator."""
+
+    def __init__(self, navigator, step):
+        track = GrowingTrack(np.asarray(T_VEHICLE_SENSOR.wxyz_xyz))
+        self.reports, self.count = [], len(navigator.rig)
+        self.tracker = BodyTracker(navigator, step, self.count, self.reports.append, track)
+
+    def take(self, obs, stamp_ns, change=lambda found: found):
+        for camera in range(self.count):
+            self.tracker.add(camera, stamp_ns, change(detections(obs, camera)))
+        self.tracker.add_odometry(stamp_ns, IDENTITY)
+        self.tracker._handle(*self.tracker._next())
+        return self.reports[-1]
+
+
+@pytest.mark.parametrize("value", [1e308, -1e30, np.inf, np.nan, 1e-300, -1.0])
+@pytest.mark.parametrize("name", ["corners_px", "sigma_px"])
+def test_an_absurd_frame_is_left_out(navigator, frames, stepped, name, value):
+    alone = Alone(navigator, stepped)
+    alone.take(frames[0], 1_000_000_000)
+
+    def change(found):
+        return replace(found, **{name: np.full_like(getattr(found, name), value)})
+
+    for number in range(3):
+        report = alone.take(frames[0], 1_100_000_000 + 100_000_000 * number, change)
+        assert report.is_finite
+    report = alone.take(frames[0], 1_500_000_000)
+    assert report.is_finite
+    assert report.located
+
+
+def test_a_stamp_of_another_year_does_not_end_it(navigator, frames, stepped):
+    """Nor one in the odometry: nothing comes after it for good."""
+    alone = Alone(navigator, stepped)
+    alone.take(frames[0], 1_000_000_000)
+    alone.take(frames[0], 2**61)
+    last = len(alone.reports)
+    for number in range(5):
+        stamp_ns = 1_100_000_000 + 100_000_000 * number
+        for camera in range(alone.count):
+            alone.tracker.add(camera, stamp_ns, detections(frames[0], camera))
+        for _ in range(4):
+            alone.tracker.add_odometry(stamp_ns + 1, IDENTITY)
+    alone.tracker._handle(*alone.tracker._next())
+    assert len(alone.reports) == last + 1
+    assert alone.reports[-1].now_ns < 2_000_000_000
+    assert alone.tracker._odometry.reaches(1_500_000_000)
+    assert not alone.tracker._odometry.reaches(2**60)
+
+
+def test_an_odometry_s_body_elsewhere_on_the_rig_is_taken_for_it():
+    """A nav_msgs/Odometry tells pose and twist of its own body."""
+    here, T_odom_vehicle = np.asarray(T_VEHICLE_SENSOR.wxyz_xyz), T_MAP_ODOM
+    pose = np.asarray((T_odom_vehicle @ T_VEHICLE_SENSOR).wxyz_xyz).tolist()
+    twist = np.asarray(T_VEHICLE_SENSOR.inverse().adjoint() @ TWIST).tolist()
+    message = Named(
+        pose=Named(
+            pose=Named(
+                position=Named(**dict(zip("xyz", pose[4:], strict=True))),
+                orientation=Named(**dict(zip("wxyz", pose[:4], strict=True))),
+            )
+        ),
+        twist=Named(
+            twist=Named(
+                linear=Named(**dict(zip("xyz", twist[:3], strict=True))),
+                angular=Named(**dict(zip("xyz", twist[3:], strict=True))),
+            )
+        ),
+    )
+    odom = OdomPose(here)
+    odom.add(0, message)
+    for late_s in (0.0, 0.1):
+        expected = np.asarray((T_odom_vehicle @ jaxlie.SE3.exp(TWIST * late_s)).wxyz_xyz)
+        away = compose(inverse(odom.at(round(late_s * 1e9))), expected)
+        # The way is taken along the turn's middle.
+        assert np.linalg.norm(away[1:]) < 2e-5

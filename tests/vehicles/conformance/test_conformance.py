@@ -1,0 +1,351 @@
+"""The checks for plug-ins: a good plug-in passes, and each fault of a bad one is named."""
+
+import threading
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxnav.detection.types import Detections
+from jaxnav.drive.interfaces import Frame, Odometry
+from jaxnav.vehicles.conformance import check_cameras, check_vehicle
+from tests.helpers.setups import (
+    FULL_THROTTLE,
+    GoodCamera,
+    GoodVehicle,
+    good_cameras,
+    setup_with,
+)
+
+SETUP = setup_with()
+SHORT_RIG = setup_with(SETUP.rig.first(2))
+
+
+def throttle_of(vehicle):
+    return vehicle.throttle
+
+
+def test_a_good_vehicle_passes():
+    opened = []
+    check_vehicle(lambda setup: opened.append(GoodVehicle(setup)) or opened[0], SETUP, throttle_of)
+    assert opened[0].closed
+    assert opened[0].throttle == 0
+    before = threading.active_count()
+    check_vehicle(GoodVehicle, SETUP)  # nor do its threads stay
+    time.sleep(0.05)
+    assert threading.active_count() <= before
+
+
+class NoStop(GoodVehicle):
+    stop = None
+
+
+class NoTimeout(GoodVehicle):
+    timeout_s = 0.0
+
+
+class TextTimeout(GoodVehicle):
+    timeout_s = "soon"
+
+
+class NotANumber(GoodVehicle):
+    def read(self):
+        return Odometry(time.monotonic_ns(), float("nan"), 0.0)
+
+
+class FloatStamp(GoodVehicle):
+    def read(self):
+        return Odometry(time.monotonic(), 0.0, 0.0)
+
+
+class WallClock(GoodVehicle):
+    def read(self):
+        return Odometry(time.time_ns(), 0.0, 0.0)
+
+
+class BootClock(GoodVehicle):
+    def read(self):
+        return Odometry(time.monotonic_ns() - 3_000_000_000, 0.0, 0.0)
+
+
+class ClockStandsStill(GoodVehicle):
+    def read(self):
+        self.stamp_ns = getattr(self, "stamp_ns", time.monotonic_ns())
+        return Odometry(self.stamp_ns, 0.0, 0.0)
+
+
+class GoesBack(GoodVehicle):
+    count = 0
+
+    def read(self):
+        self.count += 1
+        return Odometry(time.monotonic_ns() - 20_000_000 * (self.count % 3), 0.0, 0.0)
+
+
+class SlowRead(GoodVehicle):
+    def read(self):
+        time.sleep(0.06)
+        return super().read()
+
+
+class NoReading(GoodVehicle):
+    def read(self):
+        return None
+
+
+class AlwaysBroken(GoodVehicle):
+    def read(self):
+        raise OSError("no cable")
+
+
+class NeverValid(GoodVehicle):
+    def read(self):
+        return Odometry(time.monotonic_ns(), 0.0, 0.0, valid=False)
+
+
+class RaisesValueError(GoodVehicle):
+    def write(self, steering_rad, throttle):
+        if abs(throttle) == FULL_THROTTLE:
+            raise ValueError("too fast")
+        super().write(steering_rad, throttle)
+
+
+class StopWaits(GoodVehicle):
+    """Until who writes is done, who then lets it go first: locks know no order of their own."""
+
+    stops = False
+
+    def write(self, steering_rad, throttle):
+        while self.stops:
+            time.sleep(0.001)
+        with self._lock:
+            time.sleep(0.3)
+        super().write(steering_rad, throttle)
+
+    def stop(self):
+        self.stops = True
+        super().stop()
+        self.stops = False
+
+
+class StopHangs(GoodVehicle):
+    def stop(self):
+        threading.Event().wait()
+
+
+class OneThreadOnly(GoodVehicle):
+    """As many a driver: what was begun in one thread must not be touched by another."""
+
+    thread = None
+
+    def read(self):
+        self.thread = threading.get_ident()
+        return super().read()
+
+    def stop(self):
+        if self.thread != threading.get_ident():
+            raise RuntimeError("wrong thread")
+
+
+class StopForgets(GoodVehicle):
+    def stop(self):
+        pass
+
+
+class ReadDrivesOn(GoodVehicle):
+    """Every read sends the last command once more."""
+
+    last = 0.0
+
+    def write(self, steering_rad, throttle):
+        self.last = self.throttle = throttle
+
+    def read(self):
+        self.throttle = self.last
+        return super().read()
+
+
+class CloseDrivesOn(GoodVehicle):
+    def close(self):
+        self.closed = True
+
+
+class WriteAfterClose(GoodVehicle):
+    def write(self, steering_rad, throttle):
+        self.throttle = throttle
+
+
+class CloseOnce(GoodVehicle):
+    def close(self):
+        if self.closed:
+            raise RuntimeError("closed already")
+        super().close()
+
+
+@pytest.mark.parametrize(
+    ("broken", "sentence"),
+    [
+        (NoStop, r"the vehicle has no stop\(\)"),
+        (NoTimeout, "timeout_s must be positive, or inf, not 0.0"),
+        (TextTimeout, "timeout_s is no number but 'soon'"),
+        (NotANumber, "speed_mps of a valid Odometry must be a finite number, not nan"),
+        (FloatStamp, "stamp_ns of an Odometry must be an int"),
+        (WallClock, "stamp_ns of an Odometry lies .* s in the future"),
+        (BootClock, "stamp_ns of an Odometry is 3.* s old: it must be of time.monotonic_ns"),
+        (ClockStandsStill, r"the stamps of read\(\) stood still for 0.5 s"),
+        (GoesBack, r"the stamps of read\(\) go back in time"),
+        (SlowRead, r"read\(\) took longer than 0.05 s"),
+        (NoReading, r"read\(\) gives None, expected an Odometry"),
+        (AlwaysBroken, r"read\(\) raised OSError for 0.5 s: no cable"),
+        (NeverValid, r"no reading of read\(\) was valid"),
+        (RaisesValueError, r"write\(0.*\) raised ValueError: too fast; only OSError is allowed"),
+        (StopWaits, r"stop\(\) took .* s"),
+        (StopHangs, r"stop\(\) did not return within 1.2 s"),
+        (OneThreadOnly, r"stop\(\) raised RuntimeError: wrong thread"),
+        (StopForgets, r"the throttle is 0.3 after stop\(\), it must be 0"),
+        (ReadDrivesOn, "the throttle is 0.3 when it is read after stop"),
+        (CloseDrivesOn, r"the throttle is 0.3 after close\(\), it must be 0"),
+        (WriteAfterClose, r"the throttle is 0.3 when it is written after close\(\)"),
+        (CloseOnce, r"a second close\(\) raised RuntimeError: closed already"),
+    ],
+)
+def test_a_broken_promise_of_a_vehicle_is_named(broken, sentence, monkeypatch):
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._PATIENCE_S", 0.5)
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._BUSY_S", 0.03)
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._STOP_S", 0.2)
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._READINGS", 6)
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle.HANGS_S", 1.2)
+    monkeypatch.setattr("jaxnav.vehicles.conformance.calls.HANGS_S", 1.2)
+    with pytest.raises(AssertionError, match=sentence):
+        check_vehicle(broken, SETUP, throttle_of)
+
+
+def test_a_hook_that_sees_nothing_is_named(monkeypatch):
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._BUSY_S", 0.03)
+    with pytest.raises(AssertionError, match=r"throttle_of\(\) says 0 after write"):
+        check_vehicle(GoodVehicle, SETUP, lambda vehicle: 0.0)
+
+
+def test_good_cameras_pass():
+    seen = []
+
+    def factory(setup, vehicle):
+        seen.append(vehicle)
+        vehicle.write(0.0, 0.0)
+        assert vehicle.read().valid
+        return good_cameras(setup, vehicle)
+
+    check_cameras(factory, SHORT_RIG)
+    assert seen[0].timeout_s > 0
+    given = GoodVehicle(SETUP)
+    check_cameras(factory, SHORT_RIG, given)
+    assert seen[1] is given
+
+
+def broken_camera(**changes):
+    """Both cameras of the rig with other methods."""
+    broken = type("Broken", (GoodCamera,), changes)
+    return lambda setup, vehicle: [
+        broken(n, s) for n, s in zip(setup.rig.names, setup.rig.image_sizes_px, strict=True)
+    ]
+
+
+def read_forever(self, timeout_s):
+    """Gives what it has, then waits for more, whoever closes it."""
+    if self.number < 5:
+        return GoodCamera.read(self, timeout_s)
+    time.sleep(min(timeout_s, 3.0))
+    return None
+
+
+def in_one_buffer(self):
+    self.buffer = getattr(self, "buffer", GoodCamera.image(self))
+    self.buffer[:] = self.number
+    return self.buffer
+
+
+@pytest.mark.parametrize(
+    ("factory", "sentence"),
+    [
+        (lambda s, v: None, "the factory gives no sequence of cameras"),
+        (lambda s, v: [SimpleNamespace(name="front")], r"camera 0 has no read\(\), close\(\)"),
+        (
+            lambda s, v: good_cameras(s, v)[::-1],
+            "the cameras are right, front, those of the rig front, right",
+        ),
+        (lambda s, v: good_cameras(s, v)[:1], "the cameras are front, those of the rig"),
+        (
+            broken_camera(stamp_ns=lambda self: 7),
+            "stamp_ns of a frame of the camera front is .* s old",
+        ),
+        (
+            broken_camera(stamp_ns=lambda self: time.monotonic_ns() + 10**8),
+            "stamp_ns of a frame of the camera front lies .* s in the future",
+        ),
+        (
+            broken_camera(
+                stamp_ns=lambda self: (
+                    setattr(self, "first", getattr(self, "first", time.monotonic_ns()))
+                    or self.first
+                )
+            ),
+            "the camera front gives the same or an older stamp again",
+        ),
+        (
+            broken_camera(image=lambda self: GoodCamera.image(self).astype(float)),
+            "the image of a frame of the camera front is float64, expected uint8",
+        ),
+        (
+            broken_camera(image=lambda self: GoodCamera.image(self).T),
+            r"has the shape \(820, 410\), the rig says 820x410",
+        ),
+        (broken_camera(image=lambda self: None), "holds neither an image nor detections"),
+        (broken_camera(image=in_one_buffer), "the camera front changes the image of a frame"),
+        (
+            broken_camera(read=lambda self, timeout_s: np.zeros((410, 820), np.uint8)),
+            "expected a Frame or None",
+        ),
+        (
+            broken_camera(read=lambda self, timeout_s: self.closed.wait(0.4) or None),
+            r"read\(0\) of the camera front took 0.4",
+        ),
+        (
+            broken_camera(read=lambda self, timeout_s: self.closed.wait(timeout_s) or None),
+            "the camera front gave 0 frames in 0.5 s, expected 5",
+        ),
+        (
+            broken_camera(read=lambda self, timeout_s: 1 / 0),
+            r"read\(0\) of the camera front raised ZeroDivisionError",
+        ),
+        (
+            broken_camera(read=read_forever),
+            r"a read\(\) of the camera front that waits while close\(\) is called did not return",
+        ),
+        (
+            broken_camera(close=lambda self: self.closed.set() or 1 / 0),
+            r"close\(\) of the camera front raised ZeroDivisionError",
+        ),
+    ],
+)
+def test_a_broken_promise_of_a_camera_is_named(factory, sentence, monkeypatch):
+    monkeypatch.setattr("jaxnav.vehicles.conformance.cameras._PATIENCE_S", 0.5)
+    with pytest.raises(AssertionError, match=sentence):
+        check_cameras(factory, SHORT_RIG)
+
+
+@pytest.mark.parametrize("shape", [(2, 4, 2), (2, 8)])
+def test_a_camera_may_detect_by_itself(shape):
+    found = Detections(
+        np.arange(2), np.zeros(shape), np.ones((2, 4)), np.ones(2, bool), ("tag36h11",) * 2
+    )
+
+    def read(self, timeout_s):
+        frame = GoodCamera.read(self, timeout_s)
+        return frame and Frame(frame.stamp_ns, detections=found)
+
+    if shape == (2, 4, 2):
+        check_cameras(broken_camera(read=read), SHORT_RIG)
+        return
+    with pytest.raises(AssertionError, match=r"the corners of .* have the shape \(2, 8\)"):
+        check_cameras(broken_camera(read=read), SHORT_RIG)

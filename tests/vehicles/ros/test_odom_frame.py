@@ -1,0 +1,100 @@
+"""odom -> base out of tf, through frames between them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxnav.files.poses import compose, inverse, matrix, pose_from_rotation_vector
+from jaxnav.vehicles.ros.odom_frame import OdomTf
+from jaxnav.vehicles.ros.source_clock import SourceClock
+
+MOUNT = pose_from_rotation_vector([0.0, 0.0, 0.3], [0.1, 0.0, 0.2])
+SPEED_MPS, TURN_RADPS = 0.5, 0.8
+
+
+def transform(parent: str, child: str, pose: np.ndarray, time_s: float) -> SimpleNamespace:
+    w, x, y, z, *xyz = pose.tolist()
+    at_ns = round(time_s * 1e9)
+    stamp = SimpleNamespace(sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+    return SimpleNamespace(
+        header=SimpleNamespace(frame_id=parent, stamp=stamp),
+        child_frame_id=child,
+        transform=SimpleNamespace(
+            translation=SimpleNamespace(**dict(zip("xyz", xyz, strict=True))),
+            rotation=SimpleNamespace(w=w, x=x, y=y, z=z),
+        ),
+    )
+
+
+def message(*transforms: SimpleNamespace) -> SimpleNamespace:
+    return SimpleNamespace(transforms=list(transforms))
+
+
+def on_the_arc(time_s: float) -> np.ndarray:
+    """T_odom_base of a car that drives a circle."""
+    psi, radius_m = TURN_RADPS * time_s, SPEED_MPS / TURN_RADPS
+    xyz_m = [radius_m * np.sin(psi), radius_m * (1 - np.cos(psi)), 0.0]
+    return pose_from_rotation_vector([0.0, 0.0, psi], xyz_m)
+
+
+@pytest.fixture
+def odom() -> OdomTf:
+    return OdomTf("odom", "base_link", lambda: SourceClock(None))
+
+
+def apart(pose: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """(m, rad) from a pose to another."""
+    between = compose(inverse(pose), other)
+    turn_rad = 2 * np.arctan2(np.linalg.norm(between[1:4]), abs(between[0]))
+    return float(np.linalg.norm(between[4:])), float(turn_rad)
+
+
+@pytest.mark.parametrize("time_s", [100.03, 100.985, 101.0, 101.05, 101.15])
+def test_between_transforms_and_a_little_after_the_car_is_on_its_arc(odom, time_s):
+    for at_s in np.arange(100.0, 101.001, 0.02):
+        odom.take(message(transform("odom", "base_link", on_the_arc(at_s), at_s)))
+    away_m, away_rad = apart(odom.at(round(time_s * 1e9)), on_the_arc(time_s))
+    assert away_m < 1e-3
+    assert away_rad < 1e-6
+
+
+def test_it_goes_on_for_no_longer_than_it_may_be_trusted(odom):
+    for at_s in (1.0, 1.1):
+        odom.take(message(transform("odom", "base_link", on_the_arc(at_s), at_s)))
+    held = odom.at(1_300_000_000)
+    np.testing.assert_array_equal(odom.at(10**11), held)
+    np.testing.assert_allclose(odom.at(0), odom.at(10**9), atol=1e-12)  # nor back before the first
+
+
+def test_a_chain_with_a_fixed_mount_is_followed(odom):
+    lifted = message(transform("/base_footprint", "/base_link", MOUNT, 0.0))
+    odom.take_static(lifted)
+    assert odom.at(5 * 10**9) is None
+    odom.take(message(transform("odom", "base_footprint", on_the_arc(5.0), 5.0)))
+    odom.take(message(transform("map", "odom", MOUNT, 5.0)))  # ours
+    np.testing.assert_allclose(odom.at(5 * 10**9), compose(on_the_arc(5.0), MOUNT), atol=1e-12)
+    np.testing.assert_allclose(matrix(odom.at(5 * 10**9))[2, 3], 0.2)
+
+
+def test_a_ring_of_frames_and_another_tree_are_nothing(odom):
+    odom.take(
+        message(transform("b", "base_link", MOUNT, 1.0), transform("base_link", "b", MOUNT, 1.0))
+    )
+    assert odom.at(10**9) is None
+    odom.take(message(transform("world", "b", MOUNT, 2.0)))
+    assert odom.at(10**9) is None
+
+
+def test_what_is_no_transform_or_repeats_changes_nothing(odom):
+    odom.take(message(transform("odom", "base_link", MOUNT, 1.0)))
+    odom.take(message(transform("odom", "base_link", np.full(7, np.nan), 1.1)))
+    odom.take(message(transform("odom", "base_link", np.zeros(7), 1.2)))
+    odom.take(message(transform("odom", "base_link", on_the_arc(3.0), 1.0)))
+    np.testing.assert_allclose(odom.at(1_100_000_000), MOUNT, atol=1e-12)
+
+
+def test_a_clock_that_was_set_back_begins_anew(odom):
+    odom.take(message(transform("odom", "base_link", MOUNT, 100.0)))
+    odom.take(message(transform("odom", "base_link", on_the_arc(1.0), 1.0)))
+    np.testing.assert_allclose(odom.at(10**9), on_the_arc(1.0), atol=1e-12)
