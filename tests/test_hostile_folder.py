@@ -92,7 +92,7 @@ def test_the_current_folder_is_handed_on_only_where_it_was_asked_for(tmp_path):
 def test_every_python_is_started_without_the_current_folder():
     sources = {path: path.read_text() for path in (ROOT / "jaxnav").rglob("*.py")}
     started = [path.name for path, text in sources.items() if "sys.executable" in text]
-    assert {"moved_vehicle.py", "rerun_view.py", "configuration.py"} <= set(started)
+    assert {"moved_vehicle.py", "view.py", "configuration.py"} <= set(started)
     for path, text in sources.items():
         assert len(re.findall(r"sys\.executable\b", text)) == text.count('sys.executable, "-P"')
         assert "multiprocessing.get_context" not in text, path

@@ -19,7 +19,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
     built = subprocess.run(command, cwd=ROOT, env=quiet, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
-    camera = (tmp_path / "reference/models.camera.html").read_text(encoding="utf-8")
+    camera = (tmp_path / "reference/core.models.camera.html").read_text(encoding="utf-8")
     assert "jaxnav.Camera" in camera
     assert "fx, fy in pixels" in camera
     assert (tmp_path / "notebooks/01_paper_experiment.html").exists()
