@@ -16,10 +16,9 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.evaluation import judge_branch
-from jaxnav.core.filter.free_body import FreeBody
-from jaxnav.core.filter.inertial_motion import InertialMotion
+from jaxnav.core.filter.choose import judge_branch
+from jaxnav.core.filter.free import ConstantVelocity, FreeBody
+from jaxnav.core.filter.imu import InertialMotion
 from jaxnav.core.filter.kalman import nis
 from jaxnav.core.models.geometry import (
     inverse_cayley,
@@ -27,8 +26,8 @@ from jaxnav.core.models.geometry import (
     rotation_from_matrix,
     safe_norm,
 )
+from jaxnav.core.models.imu import CONSUMER, TACTICAL, ImuNoise
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.preintegration import CONSUMER, TACTICAL, ImuNoise
 from jaxnav.core.navigator import Navigator
 from jaxnav.files.configuration import configure
 from jaxnav.sim.hand_held import HandHeld, imu_samples, observe

@@ -16,7 +16,7 @@ configure(float64=False, threads=1)  # before the first array, as the commands d
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 
-from jaxnav.core.filter.constant_velocity import ConstantVelocity  # noqa: E402
+from jaxnav.core.filter.free import ConstantVelocity  # noqa: E402
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar  # noqa: E402
 from jaxnav.core.models.markers import MarkerMap  # noqa: E402
 from jaxnav.core.models.rig import CameraRig  # noqa: E402

@@ -24,9 +24,9 @@ import jax.numpy as jnp  # noqa: E402
 import jaxlie  # noqa: E402
 import numpy as np  # noqa: E402
 
-from jaxnav.core.filter.constant_velocity import ConstantVelocity  # noqa: E402
+from jaxnav.core.filter.free import ConstantVelocity  # noqa: E402
 from jaxnav.core.filter.selectors import make_selector  # noqa: E402
-from jaxnav.core.models.odometry_errors import sigma_as_told  # noqa: E402
+from jaxnav.core.models.vehicle import sigma_as_told  # noqa: E402
 from jaxnav.files.poses import matrix, pose_from_matrix  # noqa: E402
 from jaxnav.recordings.other.recordings import Recording, read_recording  # noqa: E402
 from jaxnav.recordings.other.replay import Replay, errors, replay  # noqa: E402

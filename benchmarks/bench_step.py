@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import step_numpy as peer  # noqa: E402
 
 from jaxnav.core.control import Command  # noqa: E402
-from jaxnav.core.filter.ambiguity import PaperCost, Selector  # noqa: E402
+from jaxnav.core.filter.choose import PaperCost, Selector  # noqa: E402
 from jaxnav.core.filter.hypotheses import MultiHypothesis  # noqa: E402
 from jaxnav.core.linalg.levenberg_marquardt import KEEP_FOUND  # noqa: E402
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar  # noqa: E402

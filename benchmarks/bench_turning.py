@@ -23,7 +23,7 @@ import jaxnav
 from benchmarks.bench_detection import row
 from jaxnav.commands.simulate.rendered_world import SENSOR, RenderedCameras
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.core.pose.observation import Observation
 from jaxnav.detection import Tracker, make_detectors

@@ -17,7 +17,7 @@ import numpy as np
 from drive import drive, make_navigator  # examples/drive.py
 
 import jaxnav as jn
-from jaxnav.core.filter.ambiguity import PoseBelief
+from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle, wrap_angle
 
 

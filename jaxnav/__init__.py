@@ -16,31 +16,33 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxnav.core.control import Command as Command
     from jaxnav.core.control import Controller as Controller
-    from jaxnav.core.filter.ambiguity import LowestReprojection as LowestReprojection
-    from jaxnav.core.filter.ambiguity import Mahalanobis as Mahalanobis
-    from jaxnav.core.filter.ambiguity import ObjectSpace as ObjectSpace
-    from jaxnav.core.filter.ambiguity import Oracle as Oracle
-    from jaxnav.core.filter.ambiguity import OrientationGiven as OrientationGiven
-    from jaxnav.core.filter.ambiguity import PaperCost as PaperCost
-    from jaxnav.core.filter.ambiguity import RatioTest as RatioTest
-    from jaxnav.core.filter.ambiguity import Selection as Selection
-    from jaxnav.core.filter.ambiguity import Selector as Selector
-    from jaxnav.core.filter.ambiguity import Ungated as Ungated
-    from jaxnav.core.filter.bicycle_kalman import BicycleKalman as BicycleKalman
-    from jaxnav.core.filter.constant_velocity import ConstantVelocity as ConstantVelocity
+    from jaxnav.core.control import TwistCommand as TwistCommand
+    from jaxnav.core.control import TwistController as TwistController
+    from jaxnav.core.filter.choose import LowestReprojection as LowestReprojection
+    from jaxnav.core.filter.choose import Mahalanobis as Mahalanobis
+    from jaxnav.core.filter.choose import ObjectSpace as ObjectSpace
+    from jaxnav.core.filter.choose import Oracle as Oracle
+    from jaxnav.core.filter.choose import OrientationGiven as OrientationGiven
+    from jaxnav.core.filter.choose import PaperCost as PaperCost
+    from jaxnav.core.filter.choose import RatioTest as RatioTest
+    from jaxnav.core.filter.choose import Selection as Selection
+    from jaxnav.core.filter.choose import Selector as Selector
+    from jaxnav.core.filter.choose import Ungated as Ungated
     from jaxnav.core.filter.estimate import Belief as Belief
     from jaxnav.core.filter.estimate import Estimate as Estimate
+    from jaxnav.core.filter.free import ConstantVelocity as ConstantVelocity
     from jaxnav.core.filter.hypotheses import MultiHypothesis as MultiHypothesis
-    from jaxnav.core.filter.inertial_motion import InertialMotion as InertialMotion
+    from jaxnav.core.filter.imu import InertialMotion as InertialMotion
     from jaxnav.core.filter.motion import Motion as Motion
-    from jaxnav.core.models.bicycle import Vehicle as Vehicle
+    from jaxnav.core.filter.planar import BicycleKalman as BicycleKalman
     from jaxnav.core.models.camera import Camera as Camera
-    from jaxnav.core.models.gyro import Gyro as Gyro
+    from jaxnav.core.models.imu import Gyro as Gyro
     from jaxnav.core.models.markers import MarkerMap as MarkerMap
     from jaxnav.core.models.origin import planar_in_world as planar_in_world
     from jaxnav.core.models.origin import poses_in_world as poses_in_world
     from jaxnav.core.models.rig import CameraRig as CameraRig
-    from jaxnav.core.models.twist_base import TwistBase as TwistBase
+    from jaxnav.core.models.vehicle import TwistBase as TwistBase
+    from jaxnav.core.models.vehicle import Vehicle as Vehicle
     from jaxnav.core.navigator import Navigator as Navigator
     from jaxnav.core.navigator import Output as Output
     from jaxnav.core.navigator import State as State
@@ -54,8 +56,6 @@ if TYPE_CHECKING:
     from jaxnav.core.pose.refine import solve_markers as solve_markers
     from jaxnav.core.pose.residuals import e1 as e1
     from jaxnav.core.pose.residuals import e2 as e2
-    from jaxnav.core.twist_control import TwistCommand as TwistCommand
-    from jaxnav.core.twist_control import TwistController as TwistController
     from jaxnav.errors import BadInput as BadInput
     from jaxnav.files import load_camera as load_camera
     from jaxnav.files import load_markers as load_markers
@@ -71,39 +71,39 @@ if TYPE_CHECKING:
 _MODULE_OF = {
     "BadInput": "errors",
     "Belief": "core.filter.estimate",
-    "BicycleKalman": "core.filter.bicycle_kalman",
+    "BicycleKalman": "core.filter.planar",
     "Camera": "core.models.camera",
     "CameraRig": "core.models.rig",
     "Candidates": "core.pose.candidates",
     "Command": "core.control",
-    "ConstantVelocity": "core.filter.constant_velocity",
+    "ConstantVelocity": "core.filter.free",
     "Controller": "core.control",
     "Estimate": "core.filter.estimate",
-    "Gyro": "core.models.gyro",
-    "InertialMotion": "core.filter.inertial_motion",
-    "LowestReprojection": "core.filter.ambiguity",
-    "Mahalanobis": "core.filter.ambiguity",
+    "Gyro": "core.models.imu",
+    "InertialMotion": "core.filter.imu",
+    "LowestReprojection": "core.filter.choose",
+    "Mahalanobis": "core.filter.choose",
     "MarkerMap": "core.models.markers",
     "Motion": "core.filter.motion",
     "MultiHypothesis": "core.filter.hypotheses",
     "Navigator": "core.navigator",
-    "ObjectSpace": "core.filter.ambiguity",
+    "ObjectSpace": "core.filter.choose",
     "Observation": "core.pose.observation",
-    "Oracle": "core.filter.ambiguity",
-    "OrientationGiven": "core.filter.ambiguity",
+    "Oracle": "core.filter.choose",
+    "OrientationGiven": "core.filter.choose",
     "Output": "core.navigator",
-    "PaperCost": "core.filter.ambiguity",
+    "PaperCost": "core.filter.choose",
     "PosePair": "core.pose.ippe",
-    "RatioTest": "core.filter.ambiguity",
-    "Selection": "core.filter.ambiguity",
-    "Selector": "core.filter.ambiguity",
+    "RatioTest": "core.filter.choose",
+    "Selection": "core.filter.choose",
+    "Selector": "core.filter.choose",
     "Snapshot": "core.pose.observation",
     "State": "core.navigator",
-    "TwistBase": "core.models.twist_base",
-    "TwistCommand": "core.twist_control",
-    "TwistController": "core.twist_control",
-    "Ungated": "core.filter.ambiguity",
-    "Vehicle": "core.models.bicycle",
+    "TwistBase": "core.models.vehicle",
+    "TwistCommand": "core.control",
+    "TwistController": "core.control",
+    "Ungated": "core.filter.choose",
+    "Vehicle": "core.models.vehicle",
     "configure": "files.configuration",
     "e1": "core.pose.residuals",
     "e2": "core.pose.residuals",

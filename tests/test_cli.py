@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from jaxnav import cli
-from jaxnav.files import configuration
 from jaxnav.commands import COMMANDS, names
 from jaxnav.commands.drive.arguments import Locate, ReplayRecording
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.errors import BadInput
+from jaxnav.files import configuration
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
 

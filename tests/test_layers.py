@@ -33,11 +33,10 @@ CORE = {
     "models": "linalg",
     "pose": "linalg models",
     "control": "linalg models",
-    "twist_control": "linalg models control",
     "filter": "linalg models pose",
-    "navigator": "linalg models pose control twist_control filter",
-    "parameters": "linalg models pose control twist_control filter navigator",
-    "timeline": "linalg models pose control twist_control filter navigator",
+    "navigator": "linalg models pose control filter",
+    "parameters": "linalg models pose control filter navigator",
+    "timeline": "linalg models pose control filter navigator",
 }
 MAY_IMPORT_LANES = {"sim", "experiments"}
 MOST_ROOMS, MOST_ARROWS, MOST_FLOORS = 17, 80, 9
@@ -177,7 +176,7 @@ def test_the_house_is_seen_at_a_glance() -> None:
 
 def test_forbidden_arrows_are_caught() -> None:
     for module, source in [
-        ("core.linalg.trees", "from jaxnav.core.models.camera import Camera"),
+        ("core.linalg.small_matrices", "from jaxnav.core.models.camera import Camera"),
         ("core.models.geometry", "def f():\n    from jaxnav.core import pose"),
         ("core.models.geometry", "from ..pose import ippe"),
         ("core.models.camera", "from jaxnav.errors import BadInput"),

@@ -8,11 +8,11 @@ import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.core.pose.observation import Observation
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 

@@ -15,24 +15,26 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.core.control import ControlLog, ControlState, Follower
-from jaxnav.core.filter.ambiguity import Selector, Ungated
+from jaxnav.core.control import ControlLog, ControlState, Follower, follower_along
 from jaxnav.core.filter.bank import Bank, heaviest, renumber_if_empty
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.choose import Selector, Ungated
+from jaxnav.core.filter.errors import RepeatedErrors, learn_repeats, weigh_repeats
 from jaxnav.core.filter.estimate import Belief, Estimate, Evidence
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.lag import Lagged, Window
 from jaxnav.core.filter.motion import Motion
-from jaxnav.core.filter.repeats import RepeatedErrors, learn_repeats, weigh_repeats
-from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.filter.planar import BicycleKalman
+from jaxnav.core.filter.smooth import Lagged, Window
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
-from jaxnav.core.pose.candidates import Candidates, find_candidates
-from jaxnav.core.pose.consistency import ConsistentSnapshot, remove_outliers
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
+from jaxnav.core.pose.candidates import (
+    Candidates,
+    ConsistentSnapshot,
+    find_candidates,
+    remove_outliers,
+)
 from jaxnav.core.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
-from jaxnav.core.twist_control import follower_along
 
 
 class State(eqx.Module):

@@ -26,10 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.models.bicycle import Vehicle, advance
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle, advance_bicycle
 from jaxnav.core.pose.observation import MODEL_SIGMA_PX
 from jaxnav.drive.history import EventData
 from jaxnav.drive.pilot import Outcome
@@ -330,7 +330,7 @@ def _normal(
 
         # The pose where each reading begins to hold: sums cost a tenth of steps in sequence.
         zero = jnp.zeros_like(p[:3])
-        dx, dy, dpsi = jax.vmap(advance, in_axes=(None, 0, 0, 0, None))(
+        dx, dy, dpsi = jax.vmap(advance_bicycle, in_axes=(None, 0, 0, 0, None))(
             zero, speed, steering, dt_s, wheelbase_m
         ).T
         psi = jnp.cumsum(dpsi) - dpsi
@@ -341,7 +341,7 @@ def _normal(
             """The pose by odometry, relative to the start of the readings."""
             at = jnp.clip(jnp.searchsorted(edges_s, time_s, side="right") - 1, 0, None)
             after_s = time_s - edges_s[at]
-            return advance(nodes[at], speed[at], steering[at], after_s, wheelbase_m)
+            return advance_bicycle(nodes[at], speed[at], steering[at], after_s, wheelbase_m)
 
         # From the odometer's frame to the world: at time 0 the pose is p[:3].
         times = jax.vmap(along)(jnp.append(times_s - p[9], 0.0))

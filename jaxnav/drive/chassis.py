@@ -20,8 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.core.models.bicycle import Vehicle
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.interfaces import Odometry, Reading, TwistOdometry
 from jaxnav.drive.limits import Command, Limits, TwistLimits, turns_by_twist
@@ -179,7 +178,7 @@ class CarChassis:
         return isinstance(reading, Odometry) and _can_be(_CAR_READS, reading.values)
 
     def motion(self, reading: Reading) -> Motion:
-        """See `Chassis`; Eqs. 4 to 7 of the paper, as `bicycle.velocity_world`."""
+        """See `Chassis`; Eqs. 4 to 7 of the paper, as `velocity_world`."""
         speed_mps, steering_rad = reading.values
         return car_motion(speed_mps, steering_rad, self.wheelbase_m)
 

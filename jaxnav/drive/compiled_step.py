@@ -12,8 +12,8 @@ import jaxlie
 from jax.tree_util import PyTreeDef
 from jaxtyping import PyTree
 
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.core.navigator import Navigator, Step, jitted_step
 from jaxnav.files import executables
 from jaxnav.files.executable_bytes import Run

@@ -16,8 +16,7 @@ from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.limits import turns_by_twist
 
 if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
-    from jaxnav.core.models.bicycle import Vehicle
-    from jaxnav.core.models.twist_base import TwistBase
+    from jaxnav.core.models.vehicle import TwistBase, Vehicle
     from jaxnav.drive.frames import FrameDetections
     from jaxnav.drive.interfaces import Reading
     from jaxnav.drive.limits import Command

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxnav.core.filter.estimate import Belief, Evidence
-from jaxnav.core.models.gyro import Gyro
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import Gyro
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.core.timeline import Corners, Events, advance
 from jaxnav.drive.compiled_step import compile_or_load

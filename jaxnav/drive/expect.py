@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.filter.bank import Bank
-from jaxnav.core.filter.bicycle_kalman import planar_poses
+from jaxnav.core.filter.planar import planar_poses
 from jaxnav.core.models.geometry import (
     on_last_axis,
     rotation_matrix,

@@ -31,10 +31,10 @@ if TYPE_CHECKING:  # plug-ins import this file in the guard's process, which has
     import numpy as np
     from jaxtyping import UInt8
 
-    from jaxnav.core.models.bicycle import Vehicle as VehicleModel
     from jaxnav.core.models.markers import MarkerMap
     from jaxnav.core.models.rig import CameraRig
-    from jaxnav.core.models.twist_base import TwistBase
+    from jaxnav.core.models.vehicle import TwistBase
+    from jaxnav.core.models.vehicle import Vehicle as VehicleModel
     from jaxnav.detection.types import Detections
     from jaxnav.drive.standing_clock import WaitingClock
     from jaxnav.files import Route

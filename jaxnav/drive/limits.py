@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
     from typing_extensions import TypeIs
 
-    from jaxnav.core.models.bicycle import Vehicle
-    from jaxnav.core.models.twist_base import TwistBase
+    from jaxnav.core.models.vehicle import TwistBase, Vehicle
 
 Command = tuple[float, ...]
 

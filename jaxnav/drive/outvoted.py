@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.consistency import LEAST_MARKERS
+from jaxnav.core.pose.candidates import LEAST_MARKERS
 from jaxnav.core.pose.ippe import ippe_from_rays
 from jaxnav.drive.history import EventData
 from jaxnav.drive.standstill import Way, between

@@ -18,8 +18,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.core.filter.bicycle_kalman import planar_poses
 from jaxnav.core.filter.estimate import Belief
+from jaxnav.core.filter.planar import planar_poses
 from jaxnav.core.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.core.pose.candidates import Candidates

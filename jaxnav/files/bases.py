@@ -19,8 +19,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from jaxnav.core.models.gyro import GYROS, Gyro
-from jaxnav.core.models.twist_base import TWIST_AS_TOLD, TWIST_ERRORS, TwistBase
+from jaxnav.core.models.imu import GYROS, Gyro
+from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TWIST_ERRORS, TwistBase
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.files.ranges import within
 from jaxnav.files.validation import Entry, NonNegative, Number, Positive

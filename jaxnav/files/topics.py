@@ -22,8 +22,8 @@ from jaxtyping import Float
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from jaxnav.core.models.conventions import FirstCorner
-from jaxnav.core.models.odometry_errors import SCALE_AS_TOLD, TURN_AS_TOLD_RAD, sigma_as_told
-from jaxnav.core.models.preintegration import PRESETS, ImuNoise
+from jaxnav.core.models.imu import PRESETS, ImuNoise
+from jaxnav.core.models.vehicle import SCALE_AS_TOLD, TURN_AS_TOLD_RAD, sigma_as_told
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.files import poses
 from jaxnav.files.ranges import within

@@ -32,9 +32,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from jaxnav.core.models.bicycle import SENSOR_ERRORS, SENSORS_AS_TOLD, Vehicle
 from jaxnav.core.models.origin import Origin, opposite, planar_in_world, points_in_world
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, SENSORS_AS_TOLD, TwistBase, Vehicle
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files.bases import ACKERMANN, BaseFile, GyroEntry, base_data, gyro_data

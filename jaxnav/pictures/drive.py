@@ -16,8 +16,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from jaxnav.core.filter.ambiguity import Ungated
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.choose import Ungated
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.filter.selectors import SELECTORS
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.files import poses

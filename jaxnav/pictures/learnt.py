@@ -4,8 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnav.core.models.bicycle import SENSOR_ERRORS, Vehicle
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, Vehicle
 from jaxnav.pictures.localisation import BLUE, GREEN, ORANGE
 from jaxnav.recordings.learnt import Learnt
 from jaxnav.recordings.outcomes import Outcomes

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 
-from jaxnav.core.models.bicycle import SENSOR_ERRORS, Vehicle
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, Vehicle
 from jaxnav.files import poses
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.rigs import rig_file_text

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.core.models.gyro import Gyro
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import Gyro
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.pose.observation import Observation
 from jaxnav.drive.chassis import chassis_of
 from jaxnav.drive.corrections import Corrections

@@ -23,11 +23,10 @@ import jax.numpy as jnp
 from pydantic import Field, create_model, field_validator
 
 from jaxnav.core.filter.selectors import SELECTORS, make_selector
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import ZERO
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.drive.compiled_step import compile_or_load
 from jaxnav.drive.estimator import Program, advance_packed

@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnav.core.filter.bank import Bank
-from jaxnav.core.filter.camera_errors import EACH
+from jaxnav.core.filter.errors import EACH
 from jaxnav.core.filter.estimate import Belief
-from jaxnav.core.filter.sensor_errors import LEARNT, SENSORS_END
-from jaxnav.core.models.bicycle import SENSOR_ERRORS, Vehicle
+from jaxnav.core.filter.odometry import LEARNT, SENSORS_END
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TWIST_ERRORS, TwistBase
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, TWIST_ERRORS, TwistBase, Vehicle
 from jaxnav.files import poses
 
 _SURE = 3.0  # an error of less than so many of its sigmas is not worth a word

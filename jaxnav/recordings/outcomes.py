@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from pydantic import AfterValidator, create_model, model_validator
 
-from jaxnav.core.filter.bicycle_kalman import planar_poses
+from jaxnav.core.filter.planar import planar_poses
 from jaxnav.core.models.origin import inverses_in_world, planar_in_world
 from jaxnav.drive.flags import Health, Reject
 from jaxnav.drive.pilot import Outcome

@@ -2,9 +2,8 @@
 
 import equinox as eqx
 
-from jaxnav.core.models.bicycle import Vehicle
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.twist_base import TWIST_AS_TOLD, TwistBase
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase, Vehicle
 
 BASES = ("ackermann", "differential", "omni")
 IMUS = ("none", *GYROS)

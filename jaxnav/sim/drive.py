@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.control import Command
-from jaxnav.core.filter.evaluation import Branch, judge_branch
-from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.filter.choose import Branch, judge_branch
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.core.navigator import Navigator, Output, State, Step, jitted_step
 from jaxnav.core.pose.observation import Observation
 from jaxnav.errors import BadInput

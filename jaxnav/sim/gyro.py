@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from jaxnav.core.models.gyro import Gyro
+from jaxnav.core.models.imu import Gyro
 
 
 class GyroState(eqx.Module):

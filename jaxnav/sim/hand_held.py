@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxnav.core.models.geometry import rotation_from_matrix, rotation_matrix, safe_norm
-from jaxnav.core.models.imu_samples import ImuSamples
+from jaxnav.core.models.imu import ImuNoise, ImuSamples, Preintegrated
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.preintegration import ImuNoise, Preintegrated
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import Observation
 from jaxnav.sim.corners import see

@@ -14,11 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from jaxnav.core.control import Command
-from jaxnav.core.models import bicycle, twist_base
-from jaxnav.core.models.bicycle import Vehicle
-from jaxnav.core.models.twist_base import TwistBase
-from jaxnav.core.twist_control import TwistCommand
+from jaxnav.core.control import Command, TwistCommand
+from jaxnav.core.models.vehicle import TwistBase, Vehicle, advance_bicycle, advance_twist
 
 
 class CarState(eqx.Module):
@@ -78,7 +75,7 @@ def move_car(
     speed = final_mps + (state.speed_mps - final_mps) * jnp.exp(
         -dt_s / vehicle.speed_time_constant_s
     )
-    pose = bicycle.advance(
+    pose = advance_bicycle(
         state.pose,
         (state.speed_mps + speed) / 2,
         (state.steering_rad + steering) / 2,
@@ -95,7 +92,7 @@ def move_base(
     wanted = jnp.stack([command.forward_mps, command.left_mps, command.turn_radps])
     wanted = jnp.clip(wanted, -base.limits, base.limits)
     twist = wanted + (state.twist - wanted) * jnp.exp(-dt_s / base.time_constant_s)
-    return BaseState(twist_base.advance(state.pose, (state.twist + twist) / 2, dt_s), twist)
+    return BaseState(advance_twist(state.pose, (state.twist + twist) / 2, dt_s), twist)
 
 
 def move(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from jaxnav.core.linalg.trees import where
+from jaxnav.core.linalg.small_matrices import where
 from jaxnav.sim.traces import DriveTraces
 
 

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.core.filter.ambiguity import LowestReprojection
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.evaluation import judge_branch
+from jaxnav.core.filter.choose import LowestReprojection, judge_branch
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.candidates import find_candidates

@@ -20,9 +20,9 @@ from jaxnav.core.filter.bank import (
 )
 from jaxnav.core.filter.estimate import Belief, Estimate
 from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.linalg.trees import as_class
+from jaxnav.core.linalg.small_matrices import as_class
 from jaxnav.core.navigator import Navigator, Step
-from jaxnav.core.pose.consistency import ConsistentSnapshot, Inliers, find_inliers
+from jaxnav.core.pose.candidates import ConsistentSnapshot, Inliers, find_inliers
 from jaxnav.core.pose.observation import Observation
 
 # Sizes, in slots, of the banks compiled beside the whole one: nine frames of ten need a single

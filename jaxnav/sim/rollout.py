@@ -13,15 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from jaxnav.core.control import TwistCommand
 from jaxnav.core.filter.kalman import nis
 from jaxnav.core.lanes.over_lanes import lanes_first, lanes_last, over_lanes
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator, Step
 from jaxnav.core.pose.observation import Observation
-from jaxnav.core.twist_control import TwistCommand
 from jaxnav.sim.batch_jit import lanes_jit
 from jaxnav.sim.corners import drifted, see
 from jaxnav.sim.drive import PASSED_M

@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from jaxnav.core.control import Command
-from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.control import Command, TwistCommand
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import State
-from jaxnav.core.twist_control import TwistCommand
 from jaxnav.sim.gyro import GyroState
 from jaxnav.sim.plant import BaseState, CarState
 from jaxnav.sim.scenarios import Scenario

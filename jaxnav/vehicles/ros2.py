@@ -52,8 +52,8 @@ from jaxnav.vehicles.ros.connection import Connection
 if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from collections.abc import Mapping
 
-    from jaxnav.core.models.bicycle import Vehicle as VehicleModel
-    from jaxnav.core.models.twist_base import TwistBase
+    from jaxnav.core.models.vehicle import TwistBase
+    from jaxnav.core.models.vehicle import Vehicle as VehicleModel
 
 # Until somebody listens to the commands: what is sent before is lost, and a vehicle that hears
 # nothing is taken for one that is held fast.

@@ -13,14 +13,13 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.core.control import Command
-from jaxnav.core.models.bicycle import Vehicle as VehicleModel
+from jaxnav.core.control import Command, TwistCommand
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
-from jaxnav.core.models.gyro import Gyro
+from jaxnav.core.models.imu import Gyro
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
-from jaxnav.core.twist_control import TwistCommand
+from jaxnav.core.models.vehicle import TwistBase
+from jaxnav.core.models.vehicle import Vehicle as VehicleModel
 from jaxnav.detection.types import Detections
 from jaxnav.drive.interfaces import GyroReading, Reading, reading_of
 from jaxnav.files.executables import kept

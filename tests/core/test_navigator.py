@@ -13,7 +13,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxnav.core.filter.ambiguity import PaperCost, PoseBelief, PoseMeasurement, Selection
+from jaxnav.core.filter.bank import PoseBelief
+from jaxnav.core.filter.choose import PaperCost, PoseMeasurement, Selection
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from jaxnav.core.control import ControlInput, ControlState
-from jaxnav.core.filter.ambiguity import LowestReprojection, PaperCost, Ungated
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.models.bicycle import sideslip_rad
+from jaxnav.core.filter.choose import LowestReprojection, PaperCost, Ungated
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import safe_atan2, safe_norm, wrap_angle
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.odometry_errors import OdometryErrors, sigma_as_told
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import OdometryErrors, TwistBase, sideslip_rad, sigma_as_told
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from tests import worlds

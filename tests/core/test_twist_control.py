@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.core.control import ControlInput
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.control import ControlInput, TwistController
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.twist_control import TwistController
 from jaxnav.sim.plant import BaseState, move_base
 from tests import worlds
 from tests.derivatives import check_derivatives

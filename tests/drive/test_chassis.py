@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.core.models.bicycle import velocity_world
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, velocity_world
 from jaxnav.drive.chassis import BaseChassis, CarChassis, Motion, chassis_of, pace_mps
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.interfaces import Odometry, TwistOdometry

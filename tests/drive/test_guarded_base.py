@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.guard import Guard
 from jaxnav.drive.interfaces import TwistOdometry
 from jaxnav.drive.limits import TwistLimits, limits_from, limits_of

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.interfaces import Odometry, TwistOdometry
 from jaxnav.drive.pilot import Input, Outcome

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.twist_base import TWIST_AS_TOLD, TwistBase
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_car, load_vehicle, save_vehicle
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import LowestReprojection
+from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.navigator import Navigator
 from jaxnav.detection.edges import EdgeFit
 from jaxnav.drive.compiled_step import compiled_step, is_compiled
@@ -114,7 +114,7 @@ def test_the_digest_is_of_all_that_a_program_or_a_drive_depends_on(tmp_path):
     for name, of_program, of_drive in [
         ("core/pose/refine.py", True, True),
         ("core/navigator.py", True, True),
-        ("core/linalg/trees.py", True, True),
+        ("core/linalg/small_matrices.py", True, True),
         ("vehicles/sim.py", True, False),
         ("vehicles/conformance/matrix.py", False, False),
         ("recordings/messages.py", True, True),

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.core.filter.ambiguity import PaperCost, Ungated
+from jaxnav.core.filter.choose import PaperCost, Ungated
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, parameters_of
 from jaxnav.errors import BadInput

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxnav.core.control import Command
 from jaxnav.core.filter.bank import Bank, Rejections
+from jaxnav.core.filter.errors import Repeats
 from jaxnav.core.filter.estimate import Belief
-from jaxnav.core.filter.repeats import Repeats
 from jaxnav.core.navigator import Output
 from jaxnav.core.pose.candidates import Candidates
 from jaxnav.detection.types import Detections

@@ -23,7 +23,7 @@ from array import array
 
 import numpy as np
 
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.chassis import car_motion
 from jaxnav.drive.interfaces import Odometry, Setup
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.lenses import LENSES
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.core.parameters import TUNABLES, parameters_of
 from jaxnav.drive.health import Timeouts
 from jaxnav.errors import BadInput

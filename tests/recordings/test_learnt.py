@@ -8,10 +8,10 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.models.bicycle import SENSORS_AS_TOLD, Vehicle
-from jaxnav.core.models.gyro import GYROS
+from jaxnav.core.filter.planar import BicycleKalman
+from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import SENSORS_AS_TOLD, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.recordings.learnt import Learnt, as_filed, errors_of
 from tests import worlds

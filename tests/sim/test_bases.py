@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import Oracle
-from jaxnav.core.filter.sensor_errors import velocity_of_twist
-from jaxnav.core.models.gyro import GYROS, Gyro
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.control import TwistCommand
+from jaxnav.core.filter.choose import Oracle
+from jaxnav.core.filter.odometry import velocity_of_twist
+from jaxnav.core.models.imu import GYROS, Gyro
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.twist_control import TwistCommand
 from jaxnav.sim.bases import equipped
 from jaxnav.sim.gyro import read_gyro, switched_on
 from jaxnav.sim.plant import BaseState, OdometryNoise, at_rest, move_through, read_twist

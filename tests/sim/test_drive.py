@@ -6,7 +6,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import LowestReprojection, PaperCost
+from jaxnav.core.filter.choose import LowestReprojection, PaperCost
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.filter.inertial_motion import InertialMotion
+from jaxnav.core.filter.imu import InertialMotion
 from jaxnav.core.filter.kalman import nis
 from jaxnav.core.models.geometry import inverse_cayley
-from jaxnav.core.models.preintegration import CONSUMER, ImuNoise
+from jaxnav.core.models.imu import CONSUMER, ImuNoise
 from jaxnav.core.navigator import Navigator
 from jaxnav.sim.hand_held import HandHeld, imu_samples, observe
 from jaxnav.sim.single_frames import pinhole_rig

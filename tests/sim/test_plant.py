@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnav.core.control import Command
-from jaxnav.core.models.bicycle import Vehicle, curvature_per_m
+from jaxnav.core.models.vehicle import Vehicle, curvature_per_m
 from jaxnav.sim.plant import CarState, OdometryNoise, move, move_through, read_odometry
 
 VEHICLE = Vehicle.create(0.256, 0.5, 0.3, 6.0, 0.3)

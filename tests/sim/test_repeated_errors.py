@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.navigator import Navigator
 from jaxnav.sim.corners import see

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import PaperCost
+from jaxnav.core.filter.choose import PaperCost
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.sim.corners import MIN_SIDE_PX, see

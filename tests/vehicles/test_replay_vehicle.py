@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxnav import cli
-from jaxnav.core.models.gyro import GYROS
+from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.rig import PLACED_BY_HAND
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.frames import FrameDetections

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from jaxnav.core.models.gyro import Gyro
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import Gyro
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.interfaces import TwistOdometry
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds

@@ -5,7 +5,7 @@ of the reading that follows it. One interval, with one reading, leads from node 
 
     speed    = speed_scale * (read - sigma_v e_v)
     steering = steering_gain * (read - sigma_d e_d) + steering_offset
-    node'    = advance(node, speed, steering, dt, wheelbase) + slip
+    node'    = advance_bicycle(node, speed, steering, dt, wheelbase) + slip
 
 A view shows the corners of a marker from the pose at `stamp - camera_delay`. The errors are
 unknowns, not variances added to the slip: a regression on noisy readings would find too small a
@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from jaxnav.calibrate.odometry.drive import Course, Intervals, MarkerViews, ReadingSigma
-from jaxnav.core.models.bicycle import advance
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import advance_bicycle
 
 NAMES = ("speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "camera_delay_s")
 # Slip along, across (m) and about (rad), for a second: wheels don't roll exactly, and the servo
@@ -144,7 +144,7 @@ def _led(node: Array, theta: Array, interval: Intervals, sigma: Array, dt_s: Arr
     speed_mps, steering_rad = corrected(
         theta, interval.speed_mps - errors[0], interval.steering_rad - errors[1]
     )
-    return advance(node[:3], speed_mps, steering_rad, dt_s, theta[3])
+    return advance_bicycle(node[:3], speed_mps, steering_rad, dt_s, theta[3])
 
 
 @jax.jit

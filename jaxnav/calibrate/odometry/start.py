@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 
 from jaxnav.calibrate.odometry.drive import Course, Intervals, MarkerViews
 from jaxnav.calibrate.odometry.model import NODE, corrected, padded
-from jaxnav.core.models.bicycle import advance
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle, wrap_angle_np
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import advance_bicycle
 from jaxnav.core.pose.ippe import ippe_from_rays
 
 _MOST = 25.0  # largest cost of a view, or of a step between two: some detections are wrong
@@ -64,7 +64,7 @@ def _led(intervals: Intervals, theta: np.ndarray) -> np.ndarray:
     @jax.jit
     def run(speed: Array, steering: Array, dt_s: Array, wheelbase_m: Array) -> Array:
         def one(pose: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            moved = advance(pose, *row, wheelbase_m)
+            moved = advance_bicycle(pose, *row, wheelbase_m)
             return moved, moved
 
         return jax.lax.scan(one, jnp.zeros(3), (speed, steering, dt_s))[1]

@@ -15,8 +15,8 @@ import optimistix as optx
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.models.bicycle import advance
 from jaxnav.core.models.geometry import wrap_angle
+from jaxnav.core.models.vehicle import advance_bicycle
 from jaxnav.errors import BadInput
 from jaxnav.files.poses import transform
 
@@ -255,7 +255,7 @@ def _apart(x: Array, pairs: _Pairs) -> Float[Array, "P 3"]:
 
     def along(pose: Array, piece: Array) -> tuple[Array, None]:
         speed, steering = piece[0] * jnp.exp(x[3]), piece[1] * jnp.exp(x[5]) + x[4]
-        return advance(pose, speed, steering, piece[2], pairs.wheelbase_m), None
+        return advance_bicycle(pose, speed, steering, piece[2], pairs.wheelbase_m), None
 
     def one(first: Array, last: Array, pieces: Array) -> Array:
         predicted, _ = jax.lax.scan(along, of_vehicle(first), pieces)

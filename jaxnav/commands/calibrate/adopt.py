@@ -9,7 +9,7 @@ from jaxnav.commands.calibrate.arguments import CalibrateAdopt
 from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
-from jaxnav.core.models.bicycle import SENSOR_ERRORS
+from jaxnav.core.models.vehicle import SENSOR_ERRORS
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.files.provenance import calibrated_now

@@ -15,8 +15,8 @@ from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
 from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.origin import planar_in_world
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.errors import visible
 from jaxnav.files import output_folder, save_vehicle, write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now

@@ -10,9 +10,9 @@ import numpy as np
 from jaxnav.calibrate.odometry.drive import Drive
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.reading import given_files, read_shown
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.detection import Detections
 from jaxnav.detection.observe import observe
 from jaxnav.drive.interfaces import Odometry

@@ -9,10 +9,9 @@ from jaxtyping import Float
 from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import PoseViews, views
-from jaxnav.core.models.bicycle import Vehicle, curvature_per_m
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle, curvature_per_m
 from jaxnav.files import Route
 
 READABLE_PX = 12.0  # a marker this wide is read in every second picture of a car at rest

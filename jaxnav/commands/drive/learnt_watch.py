@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import jax
 
-from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Frame

@@ -15,8 +15,8 @@ from jaxnav.commands.drive.arguments import Locate
 from jaxnav.commands.drive.locate_notes import notes
 from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
-from jaxnav.core.filter.ambiguity import LowestReprojection
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.choose import LowestReprojection
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig

@@ -15,8 +15,8 @@ import numpy as np
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.learnt_watch import LearntWatch
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.origin import ZERO
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Frame

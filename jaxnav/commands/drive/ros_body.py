@@ -18,11 +18,11 @@ from jaxnav.commands.drive.ros_setup import (
     timed,
 )
 from jaxnav.commands.drive.run import searches_for
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.odometry_errors import OdometryErrors
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import OdometryErrors
 from jaxnav.core.navigator import Navigator, Step
 from jaxnav.drive.compiled_step import compiled_step
 from jaxnav.drive.interfaces import Camera, Setup

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from jaxnav.commands.drive.ros_setup import path_of
-from jaxnav.core.filter.camera_errors import EACH
-from jaxnav.core.filter.sensor_errors import LEARNT, SENSORS_END
+from jaxnav.core.filter.errors import EACH
+from jaxnav.core.filter.odometry import LEARNT, SENSORS_END
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Frame

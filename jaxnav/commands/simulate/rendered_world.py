@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxnav.commands.simulate.arguments import Demo
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.detection import Detections, Detector, Tracker, observe
 from jaxnav.detection.observe import marker_keys

@@ -6,13 +6,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxnav.commands.kinds import ScenarioCarFiles
-from jaxnav.core.filter.ambiguity import Selector
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.filter.choose import Selector
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
 from jaxnav.files import (

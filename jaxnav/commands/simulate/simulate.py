@@ -15,7 +15,7 @@ from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.core.filter.selectors import SELECTORS, make_selector
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
 from jaxnav.files import limits, load_params, write_json

@@ -15,7 +15,7 @@ from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneController as Arguments
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.core.filter.selectors import make_selector
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import parameters_of
 from jaxnav.errors import BadInput

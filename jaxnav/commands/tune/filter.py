@@ -12,8 +12,8 @@ from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
 from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, parameters_of, with_parameters
 from jaxnav.errors import BadInput

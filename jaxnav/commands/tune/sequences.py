@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import opposite, poses_in_world

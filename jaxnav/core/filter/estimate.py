@@ -8,12 +8,11 @@ import jaxlie
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.filter.ambiguity import Selection
 from jaxnav.core.filter.bank import Bank, heaviest, mixture_log_mean
+from jaxnav.core.filter.choose import Selection
+from jaxnav.core.filter.errors import Repeats
 from jaxnav.core.filter.motion import BankUpdate, Motion
-from jaxnav.core.filter.repeats import Repeats
-from jaxnav.core.pose.candidates import Candidates
-from jaxnav.core.pose.consistency import ConsistentSnapshot
+from jaxnav.core.pose.candidates import Candidates, ConsistentSnapshot
 
 
 class Belief(eqx.Module):

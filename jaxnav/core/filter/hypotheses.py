@@ -10,11 +10,15 @@ straight on the corners, instead of comparing e at two poses. How well the minim
 corners, and how much of its prior it leaves, weighs the hypothesis; motion across the line of
 sight drives the true one and its mirror image apart.
 
+Near the frontal view the two poses of a marker meet and a bank merges them; further on they part
+again. Then a hypothesis whose prior covers both is split: beside the posterior next to the
+prediction, an empty slot takes the one of the prediction and another candidate, as Gaussians.
+
 Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27 (Laplace's evidence);
 Alspach, Sorenson (1972) (Gaussian sums).
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,20 +27,282 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.filter.ambiguity import PoseBelief, PosePosterior, Selection
-from jaxnav.core.filter.bank import EVEN_LOG_WEIGHT
-from jaxnav.core.filter.branches import SecondPoses, give_slots, second_poses
-from jaxnav.core.filter.fan import CANDIDATES, fan, normalise
-from jaxnav.core.filter.flips import beyond, nearer_to_another
-from jaxnav.core.filter.gate import excess_of
-from jaxnav.core.filter.map_fit import PoseFit, fit_poses
-from jaxnav.core.filter.merging import find_heirs
+from jaxnav.core.filter.bank import EVEN_LOG_WEIGHT, PoseBelief, excess_of, find_heirs, normalise
+from jaxnav.core.filter.choose import PosePosterior, Selection
+from jaxnav.core.filter.fit import PoseFit, fit_poses
 from jaxnav.core.linalg.levenberg_marquardt import mark_found
-from jaxnav.core.linalg.small_matrices import first_highest
-from jaxnav.core.linalg.trees import where
-from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad, safe_norm, safe_sqrt
-from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.linalg.small_matrices import (
+    cholesky,
+    first_highest,
+    log_det,
+    matvec,
+    product,
+    sandwich,
+    solve_lower,
+    where,
+)
+from jaxnav.core.models.geometry import (
+    EVEN_RAD,
+    inverse_cayley,
+    on_ground,
+    rotation_error_rad,
+    rotation_matrix,
+    safe_atan2,
+    safe_norm,
+    safe_sqrt,
+    shift_and_turn,
+    wrap_angle,
+)
+from jaxnav.core.pose.candidates import SAME_POSE_RAD, Candidates
 from jaxnav.core.pose.observation import Snapshot
+
+
+def nearer_to_another(
+    T_world_vehicle: jaxlie.SE3,
+    covariance: Float[Array, "K 6 6"],
+    candidates: Candidates,
+    selected: Int[Array, ""],
+) -> Float[Array, " K"]:
+    """Probability that a candidate is nearer in angle than the selected one, for each hypothesis.
+
+    Between two candidates lies a bisector: a pose is nearer to the other one beyond it. Another one
+    is another index, and farther off than candidates that merge: of the selected one, computed
+    twice, the two roundings are a distance as well.
+    """
+    base = T_world_vehicle.wxyz_xyz
+    other = jax.vmap(lambda T: T.inverse().wxyz_xyz)(candidates.T_vehicle_world)
+    between = jax.vmap(jax.vmap(shift_and_turn, (None, 0)), (0, None))(base, other)
+    turns = between[..., 3:]  # (K, N, 3)
+    own = turns[:, selected]
+    across = turns - own[:, None]
+    is_other = candidates.valid & (jnp.arange(candidates.valid.shape[0]) != selected)
+    is_other = is_other[None] & (safe_norm(across) >= SAME_POSE_RAD)
+    across = jnp.where(is_other[..., None], across, 1)
+    length = safe_norm(across)
+    direction = across / length[..., None]
+    gap = jnp.sum(turns**2, axis=2) - jnp.sum(own**2, axis=1)[:, None]
+    gap_rad = gap / (2 * length)
+    P = covariance[:, None, 3:, 3:]
+    variance = jnp.sum(direction[..., None] * P * direction[..., None, :], axis=(2, 3))
+    sigma_rad = jnp.maximum(safe_sqrt(jnp.maximum(variance, 0)), 1e-6)
+    nearer = jax.scipy.special.erfc(gap_rad / (np.sqrt(2) * sigma_rad)) / 2
+    return jnp.max(jnp.where(is_other, nearer, 0), axis=1)
+
+
+def beyond(
+    limit_rad: Float[Array, ""] | float,
+    apart_rad: Float[Array, " K"],
+    sigma_rad: Float[Array, " K"],
+) -> Float[Array, " K"]:
+    """Probability that |N(apart_rad, sigma_rad^2)| exceeds a limit, for each hypothesis."""
+    scale = np.sqrt(2) * jnp.maximum(sigma_rad, 1e-6)
+    below, above = (limit_rad - apart_rad) / scale, (limit_rad + apart_rad) / scale
+    return (jax.scipy.special.erfc(below) + jax.scipy.special.erfc(above)) / 2
+
+
+class SecondPoses(NamedTuple):
+    """The candidates that one predicted hypothesis may have meant as well."""
+
+    wanted: Bool[Array, " N"]
+    xi: Float[Array, "N d"]  # along `freedom`, from the prediction
+
+
+class Branches(NamedTuple):
+    """The empty slots that take a candidate."""
+
+    taken: Bool[Array, " K"]
+    xi: Float[Array, "K d"]  # along `freedom`, from the prediction; 0 where none is taken
+
+
+def second_poses(
+    bank: PoseBelief,
+    index: Int[Array, ""] | int,
+    candidates: Candidates,
+    least_log_weight: Float[Array, ""] | float,
+) -> SecondPoses:
+    """The candidates that prediction and corners leave possible beside the nearest.
+
+    The nearest one is where the search from the prediction leads.
+
+    Args:
+        bank: predicted.
+        index: of the hypothesis whose prediction it is.
+        candidates: N poses of this observation.
+        least_log_weight: of a candidate, beside the most probable one.
+    """
+    freedom = bank.freedom
+    T_prior = jaxlie.SE3(bank.T_world_vehicle.wxyz_xyz[index])
+    P = sandwich(freedom.T, bank.covariance[index])
+    eye = jnp.eye(freedom.shape[1], dtype=P.dtype)
+
+    def one(
+        T_vehicle_world: jaxlie.SE3, covariance: Array, valid: Array
+    ) -> tuple[Array, Array, Array]:
+        xi = matvec(freedom.T, inverse_cayley(T_prior.inverse() @ T_vehicle_world.inverse()))
+        S = P + sandwich(freedom.T, covariance)
+        usable = valid & jnp.all(jnp.isfinite(S)) & jnp.all(jnp.isfinite(xi))
+        xi, S = jnp.where(usable, xi, 0), jnp.where(usable, S, eye)
+        root = cholesky(S)
+        away = jnp.sum(solve_lower(root, xi) ** 2)
+        return xi, jnp.where(usable, away, jnp.inf), log_det(root)
+
+    xi, away, volume = jax.vmap(one)(
+        candidates.T_vehicle_world, candidates.covariance, candidates.valid
+    )
+    cost = jnp.where(candidates.valid, candidates.cost, jnp.inf)
+    log_weight = -(cost + away + volume) / 2
+    probable = log_weight > jnp.max(log_weight) + least_log_weight
+    nearest = jnp.arange(away.shape[0]) == jnp.argmin(away)
+    return SecondPoses(probable & ~nearest & bank.initialised[index], xi)
+
+
+def give_slots(second: SecondPoses, empty: Bool[Array, " K"]) -> Branches:
+    """Each second pose in an empty slot of its own, as long as there are any."""
+    wanted = second.wanted
+    in_order = jnp.cumsum(empty)[:, None] == jnp.cumsum(wanted)[None]
+    taken = in_order & empty[:, None] & wanted[None]
+    xi = jnp.sum(jnp.where(taken[..., None], second.xi[None], 0), axis=1)
+    return Branches(jnp.any(taken, axis=1), xi)
+
+
+CANDIDATES = 3  # largest number of candidates beside the fan
+_FAN_RAD = float(np.deg2rad(80.0))  # largest viewing angle, from the marker's normal
+_RANGE_SIGMA = 0.1  # sigma of the start, as a share of the range
+_BEARING_SIGMA_RAD = 0.1
+_CANDIDATE_LOG_WEIGHT = -5.0  # of a candidate, where a member of the fan has 0
+
+
+def fan(
+    prior: PoseBelief, candidates: Candidates, snapshot: Snapshot, hypotheses: int
+) -> PoseBelief:
+    """K hypotheses: the best candidate turned about the marker, then up to three candidates.
+
+    The fan of a car turns about the vertical through the marker's centre, that of a free body in
+    two angles. The candidates weigh little; they serve markers that do not hang upright, whose
+    corners no member of a car's fan explains.
+
+    Args:
+        prior: an empty bank: its `freedom` says whether the vehicle is a car.
+        candidates: the first is turned about the largest marker in view.
+        snapshot: what is seen.
+        hypotheses: K.
+    """
+    slots = min(candidates.valid.shape[0], CANDIDATES)
+    count = hypotheses - slots
+    T_world_vehicle = jax.tree.map(lambda leaf: leaf[0], candidates.T_vehicle_world).inverse()
+    largest = jnp.argmax(snapshot.seen.visible)
+    T_world_marker = jaxlie.SE3(
+        snapshot.markers.Ts_world_marker.wxyz_xyz[snapshot.seen.marker_index[largest]]
+    )
+    T_camera_vehicle = jaxlie.SE3(
+        snapshot.rig.Ts_camera_vehicle.wxyz_xyz[snapshot.seen.camera_index[largest]]
+    )
+    center = T_world_marker.translation()
+    T_world_camera = T_world_vehicle @ T_camera_vehicle.inverse()
+    towards = T_world_camera.translation() - center
+    planar = prior.freedom.shape[1] == 3
+    if planar:
+        turns, axes, sigma_rad = _planar_fan(T_world_marker, towards, count)
+    else:
+        turns, axes, sigma_rad = _spherical_fan(T_world_marker, towards, count)
+    pivot = jaxlie.SE3.from_translation(center)
+    turned = jax.vmap(
+        lambda wxyz: (
+            (
+                pivot
+                @ jaxlie.SE3.from_rotation(jaxlie.SO3(wxyz))
+                @ pivot.inverse()
+                @ T_world_vehicle
+            ).wxyz_xyz
+        )
+    )(turns)
+    Ts_candidate = jax.vmap(lambda T: T.inverse())(candidates.T_vehicle_world).wxyz_xyz[:slots]
+    Ts_world_vehicle = jaxlie.SE3(jnp.concatenate([turned, Ts_candidate]))
+    if planar:
+        Ts_world_vehicle = on_ground(Ts_world_vehicle)
+    axes = jnp.concatenate([axes, jnp.broadcast_to(axes[:1], (slots, *axes.shape[1:]))])
+    kept = product(prior.freedom, prior.freedom.T)
+    range_m = safe_norm(towards)
+
+    def covariance(T: jaxlie.SE3, axes: Array) -> Array:
+        R = rotation_matrix(T.rotation())
+        swing = jnp.cross(axes, (T.translation() - center)[None])
+        about = jnp.concatenate([product(swing, R), product(axes, R)], axis=1)  # (axes, 6)
+        local = jnp.concatenate(
+            [jnp.full(3, _RANGE_SIGMA * range_m), jnp.full(3, _BEARING_SIGMA_RAD)]
+        )
+        return sandwich(kept, sigma_rad**2 * product(about.T, about) + jnp.diag(local**2))
+
+    light = jnp.concatenate([jnp.zeros(count), jnp.full(slots, _CANDIDATE_LOG_WEIGHT)])
+    alive = jnp.concatenate([jnp.ones(count, bool), candidates.valid[:slots]])
+    return PoseBelief(
+        T_world_vehicle=Ts_world_vehicle,
+        covariance=jax.vmap(covariance)(Ts_world_vehicle, axes),
+        log_weight=normalise(jnp.where(alive, light.astype(range_m.dtype), -jnp.inf)),
+        initialised=alive,
+        freedom=prior.freedom,
+        nuisance=prior.nuisance,
+        gate_nis=prior.gate_nis,
+        errors=None if prior.errors is None else prior.errors.fresh(),
+    )
+
+
+def _planar_fan(
+    T_world_marker: jaxlie.SE3, towards: Float[Array, " 3"], count: int
+) -> tuple[Array, Array, float]:
+    """Turns about the vertical: viewing angles from -80 to 80 degrees.
+
+    Args:
+        towards: from the marker to the camera, world.
+
+    Returns:
+        Quaternions (count, 4), axes of uncertainty (count, 1, 3), its sigma in rad.
+    """
+    normal = rotation_matrix(T_world_marker.rotation())[:, 2]
+    azimuth_rad = wrap_angle(safe_atan2(towards[1], towards[0]) - safe_atan2(normal[1], normal[0]))
+    angles_rad = jnp.linspace(-_FAN_RAD, _FAN_RAD, count, dtype=towards.dtype) - azimuth_rad
+    zero = jnp.zeros_like(angles_rad)
+    turns = jnp.stack([jnp.cos(angles_rad / 2), zero, zero, jnp.sin(angles_rad / 2)], axis=1)
+    vertical = jnp.asarray([0.0, 0.0, 1.0], towards.dtype)
+    axes = jnp.broadcast_to(vertical, (count, 1, 3))
+    return turns, axes, 2 * _FAN_RAD / max(count - 1, 1)
+
+
+def _spherical_fan(
+    T_world_marker: jaxlie.SE3, towards: Float[Array, " 3"], count: int
+) -> tuple[Array, Array, float]:
+    """Turns in both angles: viewing directions evenly over a cap of 80 degrees.
+
+    Args and result as `_planar_fan`, with two axes. Source of the spiral: Vogel (1979).
+    """
+    share = (np.arange(count) + 0.5) / count
+    cosine = 1 - share * (1 - np.cos(_FAN_RAD))
+    azimuth = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    sine = np.sqrt(1 - cosine**2)
+    views = jnp.asarray(
+        np.column_stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine]), towards.dtype
+    )
+    R_world_marker = T_world_marker.rotation()
+    direction = R_world_marker.inverse() @ towards
+    direction = direction / jnp.maximum(safe_norm(direction), 1e-9)
+    # Through the frontal view, so that the marker does not seem to roll.
+    to_frontal = _shortest_turn(direction).inverse()
+    turns_marker = jax.vmap(lambda v: (_shortest_turn(v) @ to_frontal).wxyz)(views)
+    turns = jax.vmap(
+        lambda wxyz: (R_world_marker @ jaxlie.SO3(wxyz) @ R_world_marker.inverse()).wxyz
+    )(turns_marker)
+    Rs = jax.vmap(lambda v: rotation_matrix(R_world_marker @ _shortest_turn(v)))(views)
+    axes = jnp.swapaxes(Rs[:, :, :2], 1, 2)
+    area = 2 * np.pi * (1 - np.cos(_FAN_RAD)) / count
+    return turns, axes, float(np.sqrt(area) / 2)
+
+
+def _shortest_turn(direction: Float[Array, " 3"]) -> jaxlie.SO3:
+    """The rotation that carries (0, 0, 1) into a unit vector not opposite to it."""
+    x, y, z = direction
+    wxyz = jnp.stack([jnp.maximum(1 + z, 1e-3), -y, x, jnp.zeros_like(x)])
+    return jaxlie.SO3(wxyz).normalize()
+
 
 # Corners off by more than so many of their sigmas, however the vehicle stands, start no branch.
 _TELLS_BRANCHES = 2.0
@@ -59,7 +325,7 @@ class MultiHypothesis(eqx.Module):
     `control.Exploration` and docs/design.md, Ambiguity).
 
     Where the prediction of a settled bank spans a second candidate as well, an empty slot takes
-    that posterior (see `branches.py`).
+    that posterior (see `hypotheses.py`).
 
     The bank can't decide while the vehicle stands and both poses fit the image equally well. It
     takes the corner errors of different frames for independent: the corners' sigma has to include

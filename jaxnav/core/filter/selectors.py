@@ -1,6 +1,6 @@
 """Selectors by the names that files and command lines use."""
 
-from jaxnav.core.filter.ambiguity import (
+from jaxnav.core.filter.choose import (
     LowestReprojection,
     Mahalanobis,
     ObjectSpace,

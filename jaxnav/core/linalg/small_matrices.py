@@ -4,11 +4,15 @@ Under vmap every scalar below is an array over the batch, so thousands of 3 x 3 
 side by side in vector registers. XLA's batched LAPACK calls on the CPU cost several times more,
 and with some thousand matrices inside a scan they have been seen to deadlock (jaxlib 0.10, two
 cores).
+
+`where` for trees of arrays, and a module under another class.
 """
+
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 # Up to here comparing every value with every other is faster than a sort.
 _FEW = 32
@@ -232,3 +236,26 @@ def first_highest(values: Float[Array, " n"], within: Float[Array, ""] | float) 
     Where values are equal by construction, `argmax` is the choice of the machine's rounding.
     """
     return jnp.argmax(values >= jnp.max(values) - within)
+
+
+_Tree = TypeVar("_Tree")
+_Module = TypeVar("_Module")
+
+
+def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
+    """`jnp.where` of every leaf; the condition's axes are the leaves' leading ones."""
+
+    def choose(a: ArrayLike, b: ArrayLike) -> Array:
+        shape = condition.shape + (1,) * (jnp.ndim(a) - condition.ndim)
+        return jnp.where(condition.reshape(shape), a, b)
+
+    chosen: _Tree = jax.tree.map(choose, yes, no)
+    return chosen
+
+
+def as_class(cls: type[_Module], module: object) -> _Module:
+    """An instance of a class, which may override methods, with the fields of another module."""
+    other = object.__new__(cls)
+    for name, part in vars(module).items():
+        object.__setattr__(other, name, part)
+    return other

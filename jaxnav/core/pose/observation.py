@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.core.linalg.small_matrices import in_order
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import quad_area
+from jaxnav.core.models.imu import Preintegrated
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.preintegration import Preintegrated
 from jaxnav.core.models.rig import CameraRig
 
 # Sigma of the error of lens calibration and rolling shutter in a corner, beside its own scatter.

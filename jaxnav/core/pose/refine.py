@@ -31,17 +31,18 @@ from jaxnav.core.models.geometry import ON_GROUND, rotation_matrix, safe_norm, s
 from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.ippe import PosePair, ippe_square
-from jaxnav.core.pose.linearised import (
+from jaxnav.core.pose.observation import Sightings, sightings
+from jaxnav.core.pose.pair_lanes import solve_pairs
+from jaxnav.core.pose.residuals import (
+    Nuisance,
     Rows,
+    camera_errors,
     cross_product,
     pinhole_rows,
     reprojection_rows,
     turn_arms,
     wrench,
 )
-from jaxnav.core.pose.nuisance import Nuisance, camera_errors
-from jaxnav.core.pose.observation import Sightings, sightings
-from jaxnav.core.pose.pair_lanes import solve_pairs
 
 # Prior sigma of an angle, rad, and of a distance, as a share of itself. It bounds the covariance
 # in directions that the corners do not determine.

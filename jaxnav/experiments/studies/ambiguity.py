@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree, Shaped
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.ambiguity import OrientationGiven, PoseBelief, Ungated
-from jaxnav.core.filter.evaluation import judge_branch, position_error_m
+from jaxnav.core.filter.bank import PoseBelief
+from jaxnav.core.filter.choose import OrientationGiven, Ungated, judge_branch, position_error_m
 from jaxnav.core.filter.selectors import SELECTORS, make_selector
 from jaxnav.core.models.geometry import inverse_cayley, rotation_error_rad, safe_sqrt
 from jaxnav.core.models.rig import CameraRig

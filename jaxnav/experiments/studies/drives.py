@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Shaped
 
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.filter.selectors import SELECTORS, make_selector
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.experiments.studies.config import Config
 from jaxnav.experiments.studies.lanes import in_precision

@@ -15,17 +15,15 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.filter.bank import Bank, heaviest
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
 from jaxnav.core.filter.kalman import nis
 from jaxnav.core.filter.motion import Motion
-from jaxnav.core.filter.sensor_errors import SIX, velocity_of_twist
-from jaxnav.core.models import twist_base
-from jaxnav.core.models.bicycle import advance
+from jaxnav.core.filter.odometry import SIX, velocity_of_twist
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import (
     T_world_vehicle_from_planar,
     planar_from_T_world_vehicle,
 )
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, advance_bicycle, advance_twist
 from jaxnav.core.navigator import Navigator, State
 from jaxnav.core.pose.observation import Observation
 from jaxnav.experiments.tuning.recorded import FrameSequences
@@ -137,9 +135,9 @@ def _carried_back(
             )
             if isinstance(vehicle, TwistBase):
                 read = velocity_of_twist(obs.twist, jnp.zeros(SIX, pose.dtype)).velocity
-                before = twist_base.advance(pose, -read, dt_s)
+                before = advance_twist(pose, -read, dt_s)
             else:
-                before = advance(pose, -speed_mps, steering_rad, dt_s, vehicle.wheelbase_m)
+                before = advance_bicycle(pose, -speed_mps, steering_rad, dt_s, vehicle.wheelbase_m)
             return jnp.where((index > 0) & (index <= frame), before, pose), None
 
         indices = jnp.arange(obs.visible.shape[0])

@@ -19,7 +19,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxnav.core.linalg.trees import where
+from jaxnav.core.linalg.small_matrices import where
 
 Loss = Callable[[Float[Array, " n"], PyTree, Float[Array, ""]], Float[Array, ""]]
 

@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.geometry import safe_norm, safe_sqrt
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.experiments.tuning.soft_switch import SoftState
 from jaxnav.sim.scenarios import Scenario
 from jaxnav.sim.world import DriveState

@@ -15,15 +15,14 @@ from jaxtyping import Array, Float
 
 from jaxnav.core.filter.bank import Bank
 from jaxnav.core.filter.estimate import Belief
-from jaxnav.core.filter.free_body import FreeBody
+from jaxnav.core.filter.free import FreeBody
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.kalman import log_likelihood
 from jaxnav.core.filter.motion import Motion
 from jaxnav.core.linalg.levenberg_marquardt import KEEP_FOUND
-from jaxnav.core.linalg.trees import as_class
+from jaxnav.core.linalg.small_matrices import as_class
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import Candidates
-from jaxnav.core.pose.consistency import ConsistentSnapshot
+from jaxnav.core.pose.candidates import Candidates, ConsistentSnapshot
 from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.experiments.tuning.branches import error_of, nees, position_states
 from jaxnav.experiments.tuning.recorded import FrameSequences

@@ -13,9 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.core.control import Command, ControlInput, ControlLog, ControlState, Follower
+from jaxnav.core.control import (
+    Command,
+    ControlInput,
+    ControlLog,
+    ControlState,
+    Follower,
+    TwistCommand,
+)
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.twist_control import TwistCommand
 from jaxnav.sim.plant import standing
 
 DONE = 0.999  # with this share past the last waypoint the drive is over

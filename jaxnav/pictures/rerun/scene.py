@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxnav.core.models.bicycle import SENSOR_ERRORS
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import ZERO, inverses_in_world, opposite, planar_in_world
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TWIST_ERRORS
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, TWIST_ERRORS
 from jaxnav.drive.flags import Fault, Health, Reject, names
 from jaxnav.files import poses
 from jaxnav.pictures.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION

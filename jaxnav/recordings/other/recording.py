@@ -22,9 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxnav.core.models.conventions import APRILTAG_FIRST_CORNER, TL_TR_BR_BL
-from jaxnav.core.models.imu_samples import ImuSamples
+from jaxnav.core.models.imu import ImuSamples, Preintegrated
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.preintegration import Preintegrated
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection.observe import double_area_px2
 from jaxnav.errors import BadInput

@@ -16,16 +16,14 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.filter.ambiguity import Selector
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.evaluation import Branch, judge_branch
-from jaxnav.core.filter.free_body import FreeBody
-from jaxnav.core.filter.inertial_motion import InertialMotion
+from jaxnav.core.filter.choose import Branch, Selector, judge_branch
+from jaxnav.core.filter.free import ConstantVelocity, FreeBody
+from jaxnav.core.filter.imu import InertialMotion
 from jaxnav.core.filter.kalman import nis
 from jaxnav.core.models.geometry import inverse_cayley
+from jaxnav.core.models.imu import Preintegrated
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import opposite, poses_in_world
-from jaxnav.core.models.preintegration import Preintegrated
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator, State
 from jaxnav.core.pose.candidates import find_candidates

@@ -13,11 +13,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
 from jaxnav.core.models.twists import TwistReader
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.detection import Detections
 from jaxnav.detection.image_search import ImageSearch, size_problem
 from jaxnav.drive.flags import Fault

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.core.filter.bank import Bank, heaviest
 from jaxnav.core.filter.estimate import Belief, Estimate
 from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.smoothing import Trail, doubt
+from jaxnav.core.filter.smooth import Trail, doubt
 from jaxnav.core.linalg.small_matrices import first_highest
 from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad
 from jaxnav.core.navigator import Navigator

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxnav.core.filter.bank import Bank
-from jaxnav.core.filter.bicycle_kalman import planar_poses
+from jaxnav.core.filter.planar import planar_poses
 from jaxnav.core.models.origin import Origin, poses_in_world
 from jaxnav.core.navigator import Output
 from jaxnav.drive.flags import names

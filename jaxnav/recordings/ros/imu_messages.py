@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.core.models.imu_samples import ImuSamples
+from jaxnav.core.models.imu import ImuSamples
 from jaxnav.files.topics import ImuEntry
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
-from jaxnav.core.models.odometry_errors import OdometryErrors, sigma_as_told
+from jaxnav.core.models.vehicle import OdometryErrors, sigma_as_told
 from jaxnav.files.poses import inverse, matrix
 from jaxnav.files.ranges import is_within
 

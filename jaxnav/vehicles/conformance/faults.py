@@ -16,11 +16,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import ZERO, Origin, planar_in_world, points_in_world
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.drive.camera_delays import CameraDelays
 from jaxnav.drive.chassis import chassis_of

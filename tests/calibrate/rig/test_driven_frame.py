@@ -11,7 +11,7 @@ from jaxnav.calibrate.rig.calibrate import calibrate_rig
 from jaxnav.calibrate.rig.driven_frame import _level, driven_frame, level_follows
 from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted
 from jaxnav.calibrate.rig.vehicle_frame import moved_to_driven
-from jaxnav.core.models.bicycle import advance
+from jaxnav.core.models.vehicle import advance_bicycle
 from jaxnav.errors import BadInput
 
 WHEELBASE_M, DT_S = 0.256, 0.02
@@ -24,7 +24,7 @@ def drive(steering_rad: np.ndarray, seed: int = 0, noise: float = 1e-3):
 
     def along(pose, command):
         speed, steering = command
-        after = advance(pose, speed, steering, jnp.asarray(DT_S), jnp.asarray(WHEELBASE_M))
+        after = advance_bicycle(pose, speed, steering, jnp.asarray(DT_S), jnp.asarray(WHEELBASE_M))
         return after, pose
 
     start = jnp.asarray([0.3, -0.2, 0.4])

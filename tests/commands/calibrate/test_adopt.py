@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.core.filter.sensor_errors import LEARNT, SENSORS_END, SIX, SLIP
-from jaxnav.core.models.bicycle import SENSORS_AS_TOLD
+from jaxnav.core.filter.odometry import LEARNT, SENSORS_END, SIX, SLIP
+from jaxnav.core.models.vehicle import SENSORS_AS_TOLD
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
 from jaxnav.recordings.message_schemas import OUTCOME
 from jaxnav.recordings.outcomes import outcome_message

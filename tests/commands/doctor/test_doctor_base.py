@@ -4,7 +4,7 @@ import pytest
 
 from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry
 from jaxnav.commands.doctor.route_file import route_file, turning_radius_m, vehicle_file
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.chassis import chassis_of
 from jaxnav.drive.interfaces import Odometry, TwistOdometry
 from jaxnav.files import calib_dir, load_route

@@ -14,10 +14,10 @@ from jaxnav.commands.doctor import rig_file, route_file
 from jaxnav.commands.doctor.markers_file import measured_corners, placed
 from jaxnav.commands.doctor.rig_file import bearings, intrinsics, lenses, places, rotations
 from jaxnav.commands.doctor.route_file import sight_along, turning_radius_m, vehicle_file
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.lenses import MOST_COEFFICIENTS
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.files import Route, calib_dir, load_route, save_rig
 from tests.helpers.findings import all_well, the_problem
 from tests.worlds import marker_map, paper_markers, qcar, qcar_rig, upright

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from jaxnav.commands.drive.observers import WIDTH, notice, status_line
 from jaxnav.commands.drive.ros_setup import check_vehicle
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.flags import Fault
 from jaxnav.errors import BadInput
 from jaxnav.files.ros import load_ros

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxnav.commands.drive.learnt_watch import ExposureWatch, LearntWatch
-from jaxnav.core.filter.sensor_errors import SENSORS_END
+from jaxnav.core.filter.odometry import SENSORS_END
 from jaxnav.detection import Tracker
 from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
 from tests.helpers.drives import make_input

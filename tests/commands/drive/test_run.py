@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import EXIT_BAD_INPUT, main
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.files import calib_dir, save_vehicle, write_params
 from jaxnav.recordings.drive_log import read_drive

@@ -10,7 +10,7 @@ from jaxnav.cli import main
 from jaxnav.commands.tune.arguments import TuneController, TuneFilter
 from jaxnav.commands.tune.controller import closed_loop, gains_of
 from jaxnav.commands.tune.filter import space_of
-from jaxnav.core.filter.ambiguity import LowestReprojection
+from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.experiments.tuning.drive_loss import DriveLoss
 from jaxnav.files import load_params
 

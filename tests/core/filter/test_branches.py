@@ -12,11 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.core.filter.ambiguity import PoseBelief
-from jaxnav.core.filter.branches import SecondPoses, give_slots, second_poses
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.map_fit import fit_poses
+from jaxnav.core.filter.bank import PoseBelief
+from jaxnav.core.filter.fit import fit_poses
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.hypotheses import MultiHypothesis, SecondPoses, give_slots, second_poses
 from jaxnav.core.models.geometry import rotation_error_rad
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.candidates import Candidates

@@ -10,20 +10,19 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from jaxnav.core.filter.ambiguity import PoseMeasurement, PosePosterior
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.camera_errors import EACH, ErrorsPosterior, common_turn, not_told
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.follow_pose import follow_pose
+from jaxnav.core.filter.choose import PoseMeasurement, PosePosterior
+from jaxnav.core.filter.errors import EACH, ErrorsPosterior, common_turn, not_told
+from jaxnav.core.filter.fit import fit_poses
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.map_fit import fit_poses
-from jaxnav.core.filter.sensor_errors import SENSORS_END, SIX, SLIP
+from jaxnav.core.filter.motion import follow_pose
+from jaxnav.core.filter.odometry import SENSORS_END, SIX, SLIP
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import ON_GROUND, T_world_vehicle_from_planar, cayley
 from jaxnav.core.models.rig import PLACED_BY_HAND
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.linearised import reprojection_rows
-from jaxnav.core.pose.nuisance import camera_slopes
 from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.residuals import camera_slopes, reprojection_rows
 from tests import worlds
 
 SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
@@ -516,7 +515,7 @@ def test_the_turn_of_cameras_alike_counts_in_radians_and_those_in_view(unseen):
 
 
 def test_a_rule_has_the_paper_s_six_states():
-    from jaxnav.core.filter.ambiguity import PaperCost
+    from jaxnav.core.filter.choose import PaperCost
 
     rule = Navigator(off_rig(), worlds.paper_markers(), off_car(), selector=PaperCost())
     assert rule.init().belief.bank.mean.shape == (1, 6)

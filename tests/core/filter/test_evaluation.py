@@ -5,7 +5,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.evaluation import judge_branch, position_error_m, rotation_error_rad
+from jaxnav.core.filter.choose import judge_branch, position_error_m
+from jaxnav.core.models.geometry import rotation_error_rad
 from jaxnav.core.pose.candidates import Candidates
 
 

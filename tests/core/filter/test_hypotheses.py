@@ -12,16 +12,13 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from jaxnav.core.filter.ambiguity import PoseBelief, PosePosterior, Selection
-from jaxnav.core.filter.bank import Bank, empty_bank
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.fan import fan
-from jaxnav.core.filter.flips import nearer_to_another
-from jaxnav.core.filter.follow_pose import follow_pose
-from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.map_fit import fit_poses
-from jaxnav.core.filter.merging import merge_heirs
+from jaxnav.core.filter.bank import Bank, PoseBelief, empty_bank, merge_heirs
+from jaxnav.core.filter.choose import PosePosterior, Selection
+from jaxnav.core.filter.fit import fit_poses
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.hypotheses import MultiHypothesis, fan, nearer_to_another
+from jaxnav.core.filter.motion import follow_pose
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import on_ground
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.candidates import Candidates, find_candidates

@@ -8,14 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter import inertial
-from jaxnav.core.filter.ambiguity import PoseMeasurement, Selection
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.inertial import slip_of, turn_of
-from jaxnav.core.filter.sensor_errors import SENSORS_END, SIX, read_velocity, velocity_of_twist
-from jaxnav.core.models.bicycle import velocity_world
-from jaxnav.core.models.gyro import GYROS, Gyro
-from jaxnav.core.models.twist_base import TWIST_AS_TOLD, TwistBase
+from jaxnav.core.filter import odometry
+from jaxnav.core.filter.choose import PoseMeasurement, Selection
+from jaxnav.core.filter.odometry import (
+    SENSORS_END,
+    SIX,
+    read_velocity,
+    slip_of,
+    turn_of,
+    velocity_of_twist,
+)
+from jaxnav.core.filter.planar import BicycleKalman
+from jaxnav.core.models.imu import GYROS, Gyro
+from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase, velocity_world
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives
@@ -120,7 +125,7 @@ def test_a_gyro_that_is_silent_or_saturated_changes_nothing(gyro_radps):
     for twist in ((0.3, 0.1, 1.0), (0.4, 0.0, -1.0), (0.0, 0.0, 0.0)):
         bank = predicted(with_gyro, bank, reading(twist, gyro_radps))
         expected = predicted(without, expected, reading(twist))
-    kept = slice(0, -inertial.GYRO)
+    kept = slice(0, -odometry.GYRO)
     np.testing.assert_allclose(bank.mean[:, kept], expected.mean, atol=1e-13)
     np.testing.assert_allclose(bank.covariance[:, kept, kept], expected.covariance, atol=1e-13)
     np.testing.assert_allclose(bank.covariance[0, -1, -1], BIAS_SIGMA**2, rtol=1e-9)
@@ -174,7 +179,7 @@ def test_errors_of_scale_and_delay_grow_with_the_turn_and_with_the_rate():
 
 def test_a_turn_s_slopes_are_its_derivatives():
     off = dataclasses.replace(GYRO, scale_sigma=0.02, delay_s=0.01, delay_sigma_s=0.01)
-    mean = jnp.asarray(np.random.default_rng(3).normal(size=SENSORS_END + inertial.GYRO) / 30)
+    mean = jnp.asarray(np.random.default_rng(3).normal(size=SENSORS_END + odometry.GYRO) / 30)
 
     def of(mean):
         turn = turn_of(off, reading(gyro_radps=1.3), mean, jnp.asarray(0.0))
@@ -226,7 +231,7 @@ def test_a_gyro_teaches_wheels_their_errors_and_their_slip(rate_radps):
     """The rows of a dense Kalman gain that belong to s, k, g, o, where the mismatch is as likely as
     not; beyond, with a slip as wide as it takes."""
     rng = np.random.default_rng(4)
-    n = SENSORS_END + inertial.GYRO
+    n = SENSORS_END + odometry.GYRO
     of_gyro = [0.01, 0.005, BIAS_SIGMA]
     scale = np.concatenate([np.full(SIX, 0.02), [0.05], TWIST_AS_TOLD, of_gyro])
     A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
@@ -314,7 +319,7 @@ def test_a_rule_that_takes_one_pose_has_the_papers_states():
     motion = BicycleKalman(base(GYROS["consumer"], TWIST_AS_TOLD))
     assert motion.for_rig(worlds.qcar_rig_by_hand(), 1).init(1).mean.shape == (1, SIX)
     many = motion.for_rig(worlds.qcar_rig_by_hand(), 2).init(2)
-    assert many.mean.shape == (2, SENSORS_END + 12 + inertial.GYRO)
+    assert many.mean.shape == (2, SENSORS_END + 12 + odometry.GYRO)
 
 
 def test_gradients_are_finite_where_it_stands():

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.inertial_motion import InertialMotion
-from jaxnav.core.models.preintegration import (
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.imu import InertialMotion
+from jaxnav.core.models.imu import (
     ImuNoise,
     Preintegrated,
     Readings,

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import LowestReprojection
-from jaxnav.core.filter.evaluation import judge_branch
+from jaxnav.core.filter.choose import LowestReprojection, judge_branch
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.candidates import find_candidates

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.smoothing import Trail
+from jaxnav.core.filter.smooth import Trail
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from tests import worlds

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxnav.core.filter.ambiguity import LowestReprojection
 from jaxnav.core.filter.bank import Bank
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.choose import LowestReprojection
+from jaxnav.core.filter.fit import fit_poses
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.kalman import white_acceleration
-from jaxnav.core.filter.map_fit import fit_poses
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import OFF_GROUND, T_world_vehicle_from_planar
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation, Snapshot, log_sigmas

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxnav.core.filter.ambiguity import PoseMeasurement, Selection
-from jaxnav.core.filter.bank import Bank, restart_broken
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.gate import Offer, apply_gate
+from jaxnav.core.filter.bank import Bank, Offer, apply_gate, restart_broken
+from jaxnav.core.filter.choose import PoseMeasurement, Selection
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.motion import Motion
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.ambiguity import PoseMeasurement
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.merging import merge_heirs
-from jaxnav.core.filter.smoothing import smoothed
+from jaxnav.core.filter.bank import merge_heirs
+from jaxnav.core.filter.choose import PoseMeasurement
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.smooth import smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
-from jaxnav.core.models.odometry_errors import OdometryErrors, sigma_as_told
+from jaxnav.core.models.vehicle import OdometryErrors, sigma_as_told
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives

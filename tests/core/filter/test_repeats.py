@@ -9,8 +9,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import PoseBelief
-from jaxnav.core.filter.repeats import RepeatedErrors, Repeats, surprise_of, unexplained
+from jaxnav.core.filter.bank import PoseBelief
+from jaxnav.core.filter.errors import RepeatedErrors, Repeats, surprise_of, unexplained
 from jaxnav.core.models.geometry import OFF_GROUND, ON_GROUND, cayley
 from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Snapshot

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.smoothing import Trail, doubt, smoothed
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.planar import BicycleKalman
+from jaxnav.core.filter.smooth import Trail, doubt, smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
 from jaxnav.core.pose.observation import Observation
 from tests import worlds

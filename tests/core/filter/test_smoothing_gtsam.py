@@ -13,12 +13,12 @@ import pytest
 from scipy.linalg import block_diag
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.smoothing import smoothed
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.smooth import smoothed
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import cayley, inverse_cayley
-from jaxnav.core.models.odometry_errors import OdometryErrors
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import OdometryErrors
 from jaxnav.core.pose.observation import Observation
 
 gtsam = pytest.importorskip("gtsam", reason="gtsam, the oracle, has no wheel here")

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.models import bicycle
+from jaxnav.core.models import vehicle
 from tests.derivatives import check_derivatives
 from tests.reference import paper
 
 WHEELBASE_M = 0.256
-velocity_world = jax.jit(bicycle.velocity_world)
-advance = jax.jit(bicycle.advance)
+velocity_world = jax.jit(vehicle.velocity_world)
+advance = jax.jit(vehicle.advance_bicycle)
 
 
 def arrays(*values):
@@ -48,7 +48,7 @@ def test_the_path_is_a_circle_of_radius_R_r():
     """Eq. 5 is the radius of the path of the point midway between the axles."""
     steering = 0.35
     poses = paper.drive((0.0, 0.0, 0.0), 1.0, steering, 1.0, WHEELBASE_M)
-    radius = 1 / float(bicycle.curvature_per_m(*arrays(steering, WHEELBASE_M)))
+    radius = 1 / float(vehicle.curvature_per_m(*arrays(steering, WHEELBASE_M)))
     beta = np.arctan(np.tan(steering) / 2)
     center = radius * np.array([-np.sin(beta), np.cos(beta)])
     np.testing.assert_allclose(np.linalg.norm(poses[:, :2] - center, axis=1), radius, atol=1e-7)
@@ -63,11 +63,11 @@ def test_the_path_is_a_circle_of_radius_R_r():
 @pytest.mark.parametrize("steering_rad", [0.0, 0.4])
 def test_derivatives(steering_rad):
     pose = jnp.asarray([0.3, 0.1, -1.0])
-    check_derivatives(bicycle.advance, pose, *arrays(0.6, steering_rad, 0.5, WHEELBASE_M))
-    check_derivatives(bicycle.advance, pose, *arrays(0.0, steering_rad, 0.0, WHEELBASE_M))
+    check_derivatives(vehicle.advance_bicycle, pose, *arrays(0.6, steering_rad, 0.5, WHEELBASE_M))
+    check_derivatives(vehicle.advance_bicycle, pose, *arrays(0.0, steering_rad, 0.0, WHEELBASE_M))
 
 
 def test_a_vehicle_from_plain_numbers(precision):
-    vehicle = bicycle.Vehicle.create(0.256, 0.5, 0.3, 10.0, 0.3)
-    assert vehicle.steering_rate_limit_radps == 5.0
-    assert {leaf.dtype for leaf in jax.tree.leaves(vehicle)} == {precision}
+    car = vehicle.Vehicle.create(0.256, 0.5, 0.3, 10.0, 0.3)
+    assert car.steering_rate_limit_radps == 5.0
+    assert {leaf.dtype for leaf in jax.tree.leaves(car)} == {precision}

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.imu_samples import ImuSamples
-from jaxnav.core.models.preintegration import (
+from jaxnav.core.models.imu import (
     CONSUMER,
+    GYROS,
     PRESETS,
     TACTICAL,
     ImuNoise,
+    ImuSamples,
     Preintegrated,
     Readings,
     preintegrate,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import expm
 
-from jaxnav.core.models.twist_base import advance
+from jaxnav.core.models.vehicle import advance_twist
 from tests.derivatives import check_derivatives
 
 
@@ -16,7 +16,7 @@ def matrix(pose):
 
 def test_a_twist_moves_along_the_exponential(precision):
     rng = np.random.default_rng(0)
-    moved = jax.jit(advance)
+    moved = jax.jit(advance_twist)
     atol = 2e-6 if precision == np.float32 else 1e-12
     for turn_radps in (0.0, 1e-6, 0.3, -7.0):
         pose, twist, dt_s = rng.normal(size=3), np.append(rng.normal(size=2), turn_radps), 0.7
@@ -28,4 +28,4 @@ def test_a_twist_moves_along_the_exponential(precision):
 
 
 def test_derivatives_are_finite_on_a_straight_way():
-    check_derivatives(advance, jnp.zeros(3), jnp.asarray([1.0, 0.5, 0.0]), jnp.asarray(0.1))
+    check_derivatives(advance_twist, jnp.zeros(3), jnp.asarray([1.0, 0.5, 0.0]), jnp.asarray(0.1))

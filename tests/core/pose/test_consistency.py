@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import both_poses, own_errors_px
-from jaxnav.core.pose.consistency import remove_outliers
+from jaxnav.core.pose.candidates import both_poses, own_errors_px, remove_outliers
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 

@@ -10,8 +10,8 @@ import pytest
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.pose.linearised import cross_product, pinhole_rows, reprojection_rows, turn_arms
 from jaxnav.core.pose.observation import Sightings, cameras_of
+from jaxnav.core.pose.residuals import cross_product, pinhole_rows, reprojection_rows, turn_arms
 from tests.derivatives import check_derivatives
 
 LENSES = {

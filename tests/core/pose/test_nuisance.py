@@ -11,9 +11,9 @@ from scipy import linalg, stats
 from scipy.spatial.transform import Rotation
 
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.pose.nuisance import Nuisance, camera_errors
 from jaxnav.core.pose.observation import sightings
 from jaxnav.core.pose.refine import RefinedPose, refine_pose
+from jaxnav.core.pose.residuals import Nuisance, camera_errors
 from tests import worlds
 from tests.derivatives import check_derivatives
 

@@ -16,10 +16,9 @@ import xarray as xr
 from jaxnav.cli import main
 from jaxnav.commands.study.studies import load_study, shipped_configs
 from jaxnav.core.filter.selectors import SELECTORS
-from jaxnav.core.models.bicycle import Vehicle
-from jaxnav.core.models.gyro import GYROS
+from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.markers import CORNER_SIGNS
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.errors import BadInput
 from jaxnav.experiments.studies import lanes
 from jaxnav.experiments.studies.ambiguity import FLIPPED, INVALID, RIGHT, SCHEMA, UNSEEN

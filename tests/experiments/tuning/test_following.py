@@ -11,13 +11,12 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.bicycle_kalman import BicycleKalman
+from jaxnav.core.filter.fit import fit_poses
 from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.filter.map_fit import fit_poses
-from jaxnav.core.models.bicycle import advance
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import cayley, planar_from_T_world_vehicle
-from jaxnav.core.models.gyro import Gyro
-from jaxnav.core.models.twist_base import TWIST_AS_TOLD, TwistBase
+from jaxnav.core.models.imu import Gyro
+from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase, advance_bicycle
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import parameters_of, with_parameters
 from jaxnav.core.pose.observation import Observation, Snapshot
@@ -246,7 +245,7 @@ def test_a_pose_is_carried_back_along_its_arcs():
         pose = jnp.asarray(begins[row])
         for frame in range(1, frames[row] + 1):
             told = (speeds[row, frame], steerings[row, frame], obs.dt_s[row, frame])
-            pose = advance(pose, *map(jnp.asarray, told), CAR.wheelbase_m)
+            pose = advance_bicycle(pose, *map(jnp.asarray, told), CAR.wheelbase_m)
         ends.append(worlds.planar(*pose).wxyz_xyz)
     back = branches._carried_back(NAVIGATOR, obs, jnp.stack(ends), jnp.asarray(frames))
     poses = np.asarray(planar_from_T_world_vehicle(jaxlie.SE3(back)))

@@ -9,15 +9,13 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.control import Command, ControlState
-from jaxnav.core.filter.ambiguity import LowestReprojection
-from jaxnav.core.models.bicycle import Vehicle
+from jaxnav.core.control import Command, ControlState, TwistCommand, follower_along
+from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
-from jaxnav.core.models.gyro import Gyro
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import Gyro
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator, State
 from jaxnav.core.parameters import with_parameters
-from jaxnav.core.twist_control import TwistCommand, follower_along
 from jaxnav.experiments.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss
 from jaxnav.experiments.tuning.driving import ClosedLoop, without_gradient
 from jaxnav.experiments.tuning.soft_switch import SoftController, SoftState, soften_switch

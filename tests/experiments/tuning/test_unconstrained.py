@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.linalg import cholesky
 from scipy.special import expit
 
-from jaxnav.core.filter.ambiguity import LowestReprojection
+from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, parameters_of, with_parameters
 from jaxnav.experiments.tuning.unconstrained import Space

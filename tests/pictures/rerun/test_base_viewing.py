@@ -5,8 +5,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 
-from jaxnav.core.models.bicycle import SENSOR_ERRORS
-from jaxnav.core.models.twist_base import TWIST_ERRORS
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, TWIST_ERRORS
 from jaxnav.pictures.rerun.scene import RerunScene
 from jaxnav.recordings.outcomes import Outcomes
 from tests.helpers.drives import make_outcome

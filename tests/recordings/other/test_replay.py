@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.core.filter.ambiguity import LowestReprojection, PaperCost
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.choose import LowestReprojection, PaperCost
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.interfaces import GyroReading, TwistOdometry
 from jaxnav.errors import BadInput
 from jaxnav.recordings.other.ros_drives import read_ros_drive

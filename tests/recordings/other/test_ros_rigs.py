@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxnav.cli import main
-from jaxnav.core.filter.ambiguity import LowestReprojection
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
-from jaxnav.core.filter.inertial_motion import InertialMotion
+from jaxnav.core.filter.choose import LowestReprojection
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.imu import InertialMotion
 from jaxnav.core.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
-from jaxnav.core.models.preintegration import CONSUMER, TACTICAL
+from jaxnav.core.models.imu import CONSUMER, TACTICAL
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 from jaxnav.recordings.other.replay import motion_of, replay

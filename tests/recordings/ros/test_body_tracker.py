@@ -10,8 +10,8 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.ambiguity import LowestReprojection
-from jaxnav.core.filter.constant_velocity import ConstantVelocity
+from jaxnav.core.filter.choose import LowestReprojection
+from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.detection.types import Detections

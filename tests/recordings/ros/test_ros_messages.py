@@ -12,9 +12,8 @@ from hypothesis import assume
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
-from jaxnav.core.models import bicycle
-from jaxnav.core.models.twist_base import TwistBase
 from jaxnav.core.models.twists import STANDSTILL_MPS, TwistReader
+from jaxnav.core.models.vehicle import TwistBase, velocity_world
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.drive.chassis import chassis_of
 from jaxnav.drive.flags import Fault
@@ -40,7 +39,7 @@ from tests.worlds import paper_markers, qcar
 
 @jax.jit
 def _velocity_world(*of: jax.Array) -> jax.Array:
-    return bicycle.velocity_world(*(jnp.asarray(value, float) for value in of))
+    return velocity_world(*(jnp.asarray(value, float) for value in of))
 
 
 @drawn(

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from jaxnav.core.models.gyro import GYROS
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.interfaces import GyroReading, Odometry, TwistOdometry
 from jaxnav.vehicles.conformance import check_vehicle
 from jaxnav.vehicles.sim import open_vehicle

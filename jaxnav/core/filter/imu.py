@@ -1,4 +1,4 @@
-"""A filter for bodies that move freely and carry an inertial measurement unit (IMU)."""
+"""The filter of a body that moves freely and carries an inertial measurement unit (IMU)."""
 
 from typing import ClassVar
 
@@ -10,14 +10,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.bank import Bank
-from jaxnav.core.filter.fan import normalise
-from jaxnav.core.filter.free_body import FreeBody, moved_by_twist
-from jaxnav.core.filter.gate import Moments
-from jaxnav.core.linalg.small_matrices import matvec, product, sandwich
-from jaxnav.core.linalg.trees import where
+from jaxnav.core.filter.bank import Bank, Moments, normalise
+from jaxnav.core.filter.free import FreeBody, moved_by_twist
+from jaxnav.core.linalg.small_matrices import matvec, product, sandwich, where
 from jaxnav.core.models.geometry import rotation_matrix, skew
-from jaxnav.core.models.preintegration import CONSUMER, ImuNoise, Preintegrated
+from jaxnav.core.models.imu import CONSUMER, ImuNoise, Preintegrated
 from jaxnav.core.pose.observation import Observation
 
 _G_MPS2 = 9.81

@@ -1,16 +1,22 @@
-"""The 3-DOF bicycle: how speed and steering move the vehicle.
+"""Vehicles: a car by the 3-DOF bicycle, other bases by their twist, and what odometry gets wrong.
 
-The reference point lies midway between the axles (Lf = Lr), where the paper puts the centre
-of gravity. Source: Liu, Schofield, Shan (2023), Eqs. 4-7.
+The reference point of a car lies midway between the axles (Lf = Lr), where the paper puts the
+centre of gravity. How the wheels of a `TwistBase` make its twist (v_x, v_y, omega) is the driver's
+affair: to the filter a differential, tracks, mecanum, omni and a swerve drive are the same.
+
+Source: Liu, Schofield, Shan (2023), Eqs. 4-7; Siegwart, Nourbakhsh, Scaramuzza (2011), section 3.2
+(kinematics of wheeled bases).
 """
 
 import equinox as eqx
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxnav.core.models.geometry import safe_sinc
-from jaxnav.core.models.gyro import Gyro
+from jaxnav.core.linalg.small_matrices import matvec
+from jaxnav.core.models.geometry import planar_rotation, rotation_matrix, safe_sinc
+from jaxnav.core.models.imu import Gyro
 
 # Errors of the sensors that a filter keeps, and their standard deviations where nobody says.
 SENSOR_ERRORS = ("speed_scale", "steering_gain", "steering_offset_rad", "camera_delay_s")
@@ -112,7 +118,7 @@ def velocity_world(
     )
 
 
-def advance(
+def advance_bicycle(
     pose: Float[Array, " 3"],
     speed_mps: Float[Array, ""],
     steering_rad: Float[Array, ""],
@@ -131,3 +137,107 @@ def advance(
     return pose + jnp.stack(
         [chord_m * jnp.cos(direction), chord_m * jnp.sin(direction), 2 * half_turn]
     )
+
+
+# Errors of its odometry that a filter keeps, and their standard deviations where nobody says:
+# wheels that are a per cent apart turn a base of 0.3 m by 0.03 rad a metre.
+TWIST_ERRORS = ("speed_scale", "turn_gain", "turn_offset_radpm", "camera_delay_s")
+TWIST_AS_TOLD = np.asarray([0.03, 0.05, 0.03, 0.02])
+
+
+class TwistBase(eqx.Module):
+    """Parameters of one base, for the estimator, the controller and the simulated base."""
+
+    forward_limit_mps: Float[Array, ""]  # |v_x| never exceeds it
+    left_limit_mps: Float[Array, ""]  # |v_y|; 0: differential drive, tracks
+    turn_limit_radps: Float[Array, ""]  # |omega|
+    time_constant_s: Float[Array, ""]  # first-order lag from command to twist
+    # Standard deviations of the errors above, as in `TWIST_AS_TOLD`; None: the odometry is exact
+    # but for white noise.
+    sensor_sigma: Float[Array, " 4"] | None = None
+    gyro: Gyro | None = None
+
+    @staticmethod
+    def create(
+        forward_limit_mps: float,
+        turn_limit_radps: float,
+        time_constant_s: float,
+        left_limit_mps: float = 0.0,
+        sensor_sigma: Float[Array | np.ndarray, " 4"] | None = None,
+        gyro: Gyro | None = None,
+    ) -> "TwistBase":
+        """A base from plain numbers."""
+        return TwistBase(
+            jnp.asarray(forward_limit_mps, float),
+            jnp.asarray(left_limit_mps, float),
+            jnp.asarray(turn_limit_radps, float),
+            jnp.asarray(time_constant_s, float),
+            None if sensor_sigma is None else jnp.asarray(sensor_sigma, float),
+            gyro,
+        )
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """Of its numbers."""
+        return self.time_constant_s.dtype
+
+    @property
+    def limits(self) -> Float[Array, " 3"]:
+        """Largest v_x m/s, v_y m/s, omega rad/s, each in either direction."""
+        return jnp.stack([self.forward_limit_mps, self.left_limit_mps, self.turn_limit_radps])
+
+
+def advance_twist(
+    pose: Float[Array, " 3"], twist: Float[Array, " 3"], dt_s: Float[Array, ""]
+) -> Float[Array, " 3"]:
+    """(x_m, y_m, psi_rad) after dt at a constant twist in the vehicle's axes: along an arc.
+
+    The chord of an arc that turns by a has the direction of its middle and the length
+    s sin(a/2) / (a/2).
+    """
+    half_turn = twist[2] * dt_s / 2
+    chord = matvec(planar_rotation(pose[2] + half_turn), twist) * dt_s
+    shorter = safe_sinc(half_turn)
+    return pose + chord * jnp.stack([shorter, shorter, jnp.ones_like(shorter)])
+
+
+ERRORS = 4  # k, and m about the vehicle's x, y and z
+# Standard deviations of k and m where nobody says: the scale of other odometers (`TWIST_AS_TOLD`),
+# and a direction that was measured by hand or by a calibration of one degree.
+SCALE_AS_TOLD = 0.03
+TURN_AS_TOLD_RAD = float(np.deg2rad(1.0))
+
+
+def sigma_as_told(
+    scale: float = SCALE_AS_TOLD, turn_rad: float = TURN_AS_TOLD_RAD
+) -> Float[np.ndarray, " 4"]:
+    """(k, m) of plain numbers."""
+    return np.asarray([scale, turn_rad, turn_rad, turn_rad])
+
+
+class OdometryErrors(eqx.Module):
+    """How far off an odometry may be, and where its body is."""
+
+    sigma: Float[Array, " 4"]  # of k, and of m, rad
+    lever_arm_m: Float[Array, " 3"]  # l
+
+    @staticmethod
+    def create(
+        sigma: Float[np.ndarray, " 4"], lever_arm_m: Float[np.ndarray, " 3"]
+    ) -> "OdometryErrors":
+        """Of plain numbers, in the process's precision."""
+        return OdometryErrors(jnp.asarray(sigma, float), jnp.asarray(lever_arm_m, float))
+
+    def corrected(
+        self, twist: Float[Array, " 6"], errors: Float[Array, " 4"]
+    ) -> Float[Array, " 6"]:
+        """The vehicle's twist (m/s, rad/s), in its axes, where the odometry tells `twist`.
+
+        Args:
+            errors: (k, m).
+        """
+        arm_m = jnp.asarray(self.lever_arm_m, twist.dtype)
+        R = rotation_matrix(jaxlie.SO3.exp(errors[1:]))
+        w = matvec(R, twist[3:])
+        at_body = matvec(R, twist[:3] + jnp.cross(twist[3:], arm_m)) * (1 + errors[0])
+        return jnp.concatenate([at_body - jnp.cross(w, arm_m), w])

@@ -8,6 +8,8 @@ and returns the pose that each of the filter's K hypotheses takes as measured. I
 prediction as poses with covariances, whatever motion model made it, so car and hand-held rig share
 every selector. The selectors here keep K = 1 and take one candidate or none; `MultiHypothesis`, in
 `hypotheses.py`, carries K > 1 and postpones the choice.
+
+`judge_branch` compares what was chosen with the truth, where that is known.
 """
 
 from typing import ClassVar, Protocol, runtime_checkable
@@ -18,9 +20,11 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.filter.camera_errors import CameraErrors, ErrorsPosterior
+from jaxnav.core.filter.bank import PoseBelief
+from jaxnav.core.filter.errors import ErrorsPosterior
 from jaxnav.core.linalg.small_matrices import cholesky, first_highest, log_det, solve_lower
 from jaxnav.core.models.geometry import (
+    EVEN_RAD,
     planar_from_T_world_vehicle,
     rotation_error_rad,
     rotation_matrix,
@@ -31,22 +35,6 @@ from jaxnav.core.models.geometry import (
 from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Snapshot, log_sigmas
 from jaxnav.core.pose.residuals import e2
-
-
-class PoseBelief(eqx.Module):
-    """The filter's prediction: K weighted hypotheses about the pose of the vehicle."""
-
-    T_world_vehicle: jaxlie.SE3  # batch axis (K,)
-    covariance: Float[Array, "K 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    log_weight: Float[Array, " K"]
-    initialised: Bool[Array, " K"]  # False before the first pose
-    freedom: Float[Array, "6 d"]  # the directions of xi in which the vehicle can move
-    # Directions of xi that the filter does not estimate, times their sigma: xi = nuisance @ N(0,1):
-    # a car rolls, pitches and bounces, and its cameras deviate from their calibration.
-    nuisance: Float[Array, "6 t"]
-    # The filter rejects measured poses whose NIS exceeds this.
-    gate_nis: Float[Array, ""] | float
-    errors: CameraErrors | None = None  # None: the filter keeps no errors of cameras
 
 
 class PoseMeasurement(eqx.Module):
@@ -363,3 +351,42 @@ def _normals_error(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Arr
     cosine = jnp.sum(normals_camera * measured, axis=2)
     turn_rad = jnp.where(known, safe_atan2(sine, cosine), 0)
     return jnp.sum((turn_rad / obs.normal_sigma_rad) ** 2)
+
+
+OUTLIER_DEG = 10.0
+
+
+class Branch(eqx.Module):
+    """Verdict on one choice of a candidate. At most one of `wrong` and `outlier` is True."""
+
+    judged: Bool[Array, ""]  # a candidate was taken
+    wrong: Bool[Array, ""]  # another candidate is closer to the truth in angle, by `EVEN_RAD`
+    outlier: Bool[Array, ""]  # no candidate lies within 10 degrees of the truth
+    ambiguous: Bool[Array, ""]  # there was more than one candidate
+
+
+def judge_branch(
+    candidates: Candidates, selected: Int[Array, ""], T_world_vehicle_true: jaxlie.SE3
+) -> Branch:
+    """Whether the selected candidate is the one nearest to the truth in angle.
+
+    Args:
+        candidates: N poses of one observation.
+        selected: index of the candidate that was taken, -1: none.
+        T_world_vehicle_true: the true pose.
+    """
+    angles_rad = jax.vmap(
+        lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T_world_vehicle_true)
+    )(candidates.T_vehicle_world)
+    angles_rad = jnp.where(candidates.valid, angles_rad, jnp.inf)
+    nearest_rad = jnp.min(angles_rad)
+    judged = selected >= 0
+    outlier = judged & (nearest_rad > jnp.deg2rad(OUTLIER_DEG))
+    off_rad = angles_rad[jnp.maximum(selected, 0)]
+    wrong = judged & ~outlier & (off_rad > nearest_rad + EVEN_RAD)
+    return Branch(judged, wrong, outlier, judged & (jnp.sum(candidates.valid) > 1))
+
+
+def position_error_m(T_a_b: jaxlie.SE3, T_a_c: jaxlie.SE3) -> Float[Array, ""]:
+    """Distance between two positions, m."""
+    return safe_norm(T_a_b.translation() - T_a_c.translation())

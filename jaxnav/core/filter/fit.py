@@ -20,9 +20,9 @@ import jaxlie
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.core.filter.ambiguity import PoseBelief, PosePosterior
-from jaxnav.core.filter.camera_errors import CameraErrors
-from jaxnav.core.filter.nuisances import ErrorsAtBest, Nuisances
+from jaxnav.core.filter.bank import CameraErrors, PoseBelief
+from jaxnav.core.filter.choose import PosePosterior
+from jaxnav.core.filter.errors import ErrorsAtBest, Nuisances
 from jaxnav.core.linalg.levenberg_marquardt import (
     ImplicitGradient,
     NormalEquations,
@@ -45,8 +45,8 @@ from jaxnav.core.models.geometry import (
     inverse_cayley_jacobian,
     rotation_matrix,
 )
-from jaxnav.core.pose.linearised import answers, cross_product, reprojection_rows, turn_arms, wrench
 from jaxnav.core.pose.observation import Snapshot, log_sigmas
+from jaxnav.core.pose.residuals import answers, cross_product, reprojection_rows, turn_arms, wrench
 
 
 class PoseFit(eqx.Module):

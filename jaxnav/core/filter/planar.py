@@ -11,33 +11,38 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.ambiguity import PoseBelief, PoseMeasurement, PosePosterior
-from jaxnav.core.filter.bank import Bank, contradicted, empty_bank, forget_lost, heaviest, known_to
-from jaxnav.core.filter.camera_errors import CameraErrors
-from jaxnav.core.filter.follow_pose import follow_pose
-from jaxnav.core.filter.gate import Moments, Offer
-from jaxnav.core.filter.inertial import (
-    GYRO,
-    Turn,
-    bias_at_rest,
-    gyro_variance,
-    slip_of,
-    turn_of,
-    turned,
+from jaxnav.core.filter.bank import (
+    Bank,
+    CameraErrors,
+    Moments,
+    Offer,
+    PoseBelief,
+    contradicted,
+    empty_bank,
+    forget_lost,
+    heaviest,
+    known_to,
 )
-from jaxnav.core.filter.motion import Motion, Planar, camera_states
-from jaxnav.core.filter.sensor_errors import (
+from jaxnav.core.filter.choose import PoseMeasurement, PosePosterior
+from jaxnav.core.filter.motion import Motion, Planar, camera_states, follow_pose
+from jaxnav.core.filter.odometry import (
+    GYRO,
     SENSORS_END,
     SIX,
     ReadVelocity,
+    Turn,
+    bias_at_rest,
     from_seen,
+    gyro_variance,
     lead_after,
     read_velocity,
     seen_pose,
+    slip_of,
     slipped,
+    turn_of,
+    turned,
 )
 from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich
-from jaxnav.core.models.bicycle import Vehicle
 from jaxnav.core.models.geometry import (
     OFF_GROUND,
     ON_GROUND,
@@ -48,9 +53,9 @@ from jaxnav.core.models.geometry import (
     safe_norm,
     wrap_angle,
 )
-from jaxnav.core.models.gyro import Gyro
+from jaxnav.core.models.imu import Gyro
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.twist_base import TwistBase
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.pose.observation import Observation
 
 
@@ -70,11 +75,11 @@ class BicycleKalman(Motion):
       the heading turns the velocity along and the drift of the position corrects the heading.
     * Q and the odometry's noise are given in the vehicle's axes, since wheels slip along and across
       themselves: numbers learned on one course are valid on another.
-    * Errors that repeat are states behind the six: five of the sensors (`sensor_errors.py`) and
-      three of each camera (`camera_errors.py`), where vehicle and rig say that there are any. The
+    * Errors that repeat are states behind the six: five of the sensors (`odometry.py`) and
+      three of each camera (`errors.py`), where vehicle and rig say that there are any. The
       corners show the pose x - tau v; the odometer's scale has a part that stays and one that comes
       and goes, the slip of the wheels.
-    * Where the vehicle has a gyro, it tells the turn of every interval (`inertial.py`).
+    * Where the vehicle has a gyro, it tells the turn of every interval (`odometry.py`).
     * The covariance of a vision pose is the candidate's own (from J'J at its minimum), plus a
       floor, since errors of successive frames are correlated.
 
@@ -342,7 +347,7 @@ class BicycleKalman(Motion):
         return turn_of(gyro, obs, mean, density)
 
     def _with_gyro(self, gyro: Gyro, mean: Array, P: Array, obs: Observation) -> Moments:
-        """The state `dt_s` later, as a gyro and the odometry have told (`inertial.py`)."""
+        """The state `dt_s` later, as a gyro and the odometry have told (`odometry.py`)."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(dtype)
         turn, before_mps = self._turn(gyro, obs, mean), mean[3:5]

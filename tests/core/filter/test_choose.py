@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxnav.core.filter.ambiguity import (
+from jaxnav.core.filter.bank import PoseBelief
+from jaxnav.core.filter.choose import (
     LowestReprojection,
     Mahalanobis,
     ObjectSpace,
     Oracle,
     OrientationGiven,
     PaperCost,
-    PoseBelief,
     PoseMeasurement,
     PosePosterior,
     RatioTest,
