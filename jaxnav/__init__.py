@@ -46,11 +46,11 @@ if TYPE_CHECKING:
     from jaxnav.core.navigator import Navigator as Navigator
     from jaxnav.core.navigator import Output as Output
     from jaxnav.core.navigator import State as State
-    from jaxnav.core.pose.candidates import Candidates as Candidates
     from jaxnav.core.pose.ippe import PosePair as PosePair
     from jaxnav.core.pose.ippe import ippe_square as ippe_square
     from jaxnav.core.pose.observation import Observation as Observation
     from jaxnav.core.pose.observation import Snapshot as Snapshot
+    from jaxnav.core.pose.refine import Candidates as Candidates
     from jaxnav.core.pose.refine import refine_pose as refine_pose
     from jaxnav.core.pose.refine import solve_marker as solve_marker
     from jaxnav.core.pose.refine import solve_markers as solve_markers
@@ -74,7 +74,7 @@ _MODULE_OF = {
     "BicycleKalman": "core.filter.planar",
     "Camera": "core.models.camera",
     "CameraRig": "core.models.rig",
-    "Candidates": "core.pose.candidates",
+    "Candidates": "core.pose.refine",
     "Command": "core.control",
     "ConstantVelocity": "core.filter.free",
     "Controller": "core.control",

@@ -7,7 +7,7 @@ Source: Liu, Schofield, Shan (2023), Eqs. 16-19; for bases that are no cars Coul
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -90,15 +90,6 @@ class ControlInput(eqx.Module):
         return jnp.where(jnp.isfinite(self.dt_s) & (self.dt_s > 0), self.dt_s, 0)
 
 
-class Way(NamedTuple):
-    """The way to the waypoint of a state."""
-
-    distance_m: Float[Array, ""]
-    alpha_rad: Float[Array, ""]  # from the course to the waypoint
-    done: Bool[Array, ""]  # the last waypoint is reached
-    drives: Bool[Array, ""]  # there is a waypoint, and a pose from which to drive there
-
-
 class Follower(eqx.Module):
     """Base class of the controllers: waypoint after waypoint, whatever is commanded."""
 
@@ -132,33 +123,20 @@ class Follower(eqx.Module):
         return ControlState(jnp.asarray(0), zero, zero, zero)
 
     def __call__(
-        self,
-        state: ControlState,
-        pose: Float[Array, " 3"],
-        located: Bool[Array, ""],
-        steering_rad: Float[Array, ""],
-        dt_s: Float[Array, ""],
-        decided: Bool[Array, ""] | bool = True,
-        to_marker_m: Float[Array, " 2"] | None = None,
-        speed_mps: Float[Array, ""] | float = np.nan,
+        self, state: ControlState, given: ControlInput
     ) -> tuple[ControlState, Any, Bool[Array, ""], ControlLog]:
         """One command, towards the next waypoint if the present one is reached.
-
-        Args:
-            state: after the previous command.
-            pose: this and all others as in `ControlInput`.
 
         Returns:
             The next state, the command, whether the last waypoint is reached, and the log.
         """
         count, index = self.waypoints_m.shape[0], state.waypoint_index
-        short_m = self.short_of(index, pose)
-        arrived = located & decided & (short_m <= 0)
+        short_m = self.short_of(index, given.pose)
+        arrived = given.located & given.decided & (short_m <= 0)
         index = jnp.minimum(index + (arrived & (index < count)), count)
         integral_ms = jnp.where(arrived, 0, state.integral_ms)
         state = ControlState(index, integral_ms, state.explored_s, state.side)
-        sensed = pose, located, steering_rad, dt_s, decided, to_marker_m, speed_mps
-        return self.towards(state, ControlInput(*sensed))
+        return self.towards(state, given)
 
     @abc.abstractmethod
     def towards(
@@ -168,8 +146,13 @@ class Follower(eqx.Module):
 
     def way(
         self, state: ControlState, given: ControlInput, sideslip_rad: Float[Array, ""] | float = 0.0
-    ) -> Way:
-        """The way to the waypoint of the state, for a course turned from the heading."""
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+        """The way to the waypoint of the state, for a course turned from the heading.
+
+        Returns:
+            Distance, m, and angle from the course, rad; whether the last waypoint is reached, and
+            whether there is one, and a pose from which to drive there.
+        """
         count, index = self.waypoints_m.shape[0], state.waypoint_index
         done = index >= count
         to_waypoint = self.waypoints_m[jnp.minimum(index, count - 1)] - given.pose[:2]
@@ -179,7 +162,7 @@ class Follower(eqx.Module):
         # A waypoint straight behind is on the left, not on the side of the last bit.
         alpha_rad = jnp.where(alpha_rad < EVEN_RAD - jnp.pi, alpha_rad + 2 * jnp.pi, alpha_rad)
         finite = jnp.isfinite(distance_m) & jnp.isfinite(alpha_rad)
-        return Way(distance_m, alpha_rad, done, given.located & ~done & finite)
+        return distance_m, alpha_rad, done, given.located & ~done & finite
 
     def short_of(self, index: Int[Array, ""], pose: Float[Array, " 3"]) -> Float[Array, ""]:
         """Distance to the circle inside which a waypoint counts as reached, m; negative inside."""

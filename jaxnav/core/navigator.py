@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float
 
-from jaxnav.core.control import ControlLog, ControlState, Follower, follower_along
+from jaxnav.core.control import ControlInput, ControlLog, ControlState, Follower, follower_along
 from jaxnav.core.filter.bank import Bank, heaviest, renumber_if_empty
 from jaxnav.core.filter.choose import Selector, Ungated
 from jaxnav.core.filter.errors import RepeatedErrors, learn_repeats, weigh_repeats
@@ -28,13 +28,9 @@ from jaxnav.core.filter.smooth import Lagged, Window
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
-from jaxnav.core.pose.candidates import (
-    Candidates,
-    ConsistentSnapshot,
-    find_candidates,
-    remove_outliers,
-)
+from jaxnav.core.pose.candidates import ConsistentSnapshot, find_candidates, remove_outliers
 from jaxnav.core.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot, slots
+from jaxnav.core.pose.refine import Candidates
 
 
 class State(eqx.Module):
@@ -127,7 +123,9 @@ class Navigator(eqx.Module):
         )  # fmt: skip
         self.corner_sigma_px = jnp.asarray(corner_sigma_px, float)
         self.model_sigma_px = jnp.asarray(model_sigma_px, float)
-        self.repeated_errors = repeated_errors or RepeatedErrors.of(self.selector.hypotheses)
+        self.repeated_errors = repeated_errors or (
+            RepeatedErrors() if self.selector.hypotheses > 1 else None
+        )
         self.max_sightings = max_sightings
         self.max_candidates = max_candidates
         self.max_lm_steps = max_lm_steps
@@ -174,7 +172,7 @@ class Navigator(eqx.Module):
             lambda: self.correct(predicted, seen),
             lambda: self.coast(predicted),
         )
-        return belief, Estimate.of(self.motion, belief, evidence)
+        return belief, Estimate.from_belief(self.motion, belief, evidence)
 
     def look(self, obs: Observation) -> ConsistentSnapshot:
         """The candidate poses of an observation, without sightings that can be no marker."""
@@ -195,7 +193,7 @@ class Navigator(eqx.Module):
         updated = motion.update(prior, selection, snapshot.obs)
         updated = updated._replace(bank=motion.sound(updated.bank))
         belief = belief.after(updated.bank, selection.decided, selection.flip_probability)
-        evidence = Evidence.of(seen, prior, selection, updated, predicted.gate_nis)
+        evidence = Evidence.from_update(seen, prior, selection, updated, predicted.gate_nis)
         best = motion.T_world_vehicle(belief.bank.mean[heaviest(belief.bank)])
         known = belief.decided & evidence.agrees
         return replace(belief, repeats=learn_repeats(*repeats, snapshot, best, known)), evidence
@@ -215,10 +213,11 @@ class Navigator(eqx.Module):
         command, done, log = None, jnp.asarray(False), None
         if self.controller is not None and control is not None:
             speed_mps, steering_rad, dt_s = obs.usable().driven(estimate.pose.dtype)
-            control, command, done, log = self.controller(
-                control, estimate.pose, estimate.located, steering_rad, dt_s, estimate.decided,
+            given = ControlInput(
+                estimate.pose, estimate.located, steering_rad, dt_s, estimate.decided,
                 self.markers.nearest_m(estimate.T_world_vehicle), speed_mps,
             )  # fmt: skip
+            control, command, done, log = self.controller(control, given)
         return control, Output(**vars(estimate), command=command, done=done, control_log=log)
 
     def snapshot(self, obs: Observation) -> Snapshot:

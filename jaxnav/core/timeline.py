@@ -145,7 +145,7 @@ def advance(
         lambda: navigator.coast(navigator.predict(belief, unheard.usable()))[0],
         lambda: belief,
     )
-    estimate = Estimate.of(navigator.motion, present, evidence)
+    estimate = Estimate.from_belief(navigator.motion, present, evidence)
     last_heard = dataclasses.replace(obs, has_odometry=jnp.asarray(True))
     control, output = navigator.act(control, estimate, last_heard)
     return belief, then, control, output

@@ -22,7 +22,7 @@ from jaxnav.core.filter.estimate import Belief
 from jaxnav.core.filter.planar import planar_poses
 from jaxnav.core.models.origin import ZERO, Origin, planar_in_world, poses_in_world
 from jaxnav.core.navigator import Navigator, Output
-from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.drive.actuation import Actuation
 from jaxnav.drive.camera_votes import CameraVotes
 from jaxnav.drive.chassis import chassis_of, pace_mps, root_of_sum

@@ -79,7 +79,7 @@ class _ByRegime(Navigator):
             def correct(predicted: Belief) -> tuple[Belief, Estimate]:
                 few = dataclasses.replace(predicted, bank=first_hypotheses(predicted.bank, size))
                 after, evidence = self.correct(few, seen) if sees else self.coast(few)
-                estimate = Estimate.of(self.motion, after, evidence)
+                estimate = Estimate.from_belief(self.motion, after, evidence)
                 whole = fill_slots(survivors_first(after.bank), empty)
                 return dataclasses.replace(after, bank=whole), estimate
 

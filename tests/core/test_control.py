@@ -9,13 +9,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from jaxnav.core.control import Controller, ControlState
+from jaxnav.core.control import ControlInput, Controller, ControlState
 from tests import worlds
 from tests.derivatives import check_derivatives
 from tests.reference import paper
 
 WHEELBASE_M = 0.256
-call = eqx.filter_jit(lambda controller, *args, **named: controller(*args, **named))
+call = eqx.filter_jit(
+    lambda controller, state, *args, **named: controller(state, ControlInput(*args, **named))
+)
 
 
 def controller(waypoints_m=worlds.WAYPOINTS_M, **changes) -> Controller:
@@ -362,10 +364,10 @@ def test_exploring_has_finite_gradients():
     @jax.grad
     def slope(floats):
         pose, to_marker_m, steering_rad, dt_s, speed_mps = floats
-        state, command, _, _ = control(
-            control.init(), pose, jnp.asarray(True), steering_rad, dt_s, jnp.asarray(False),
-            to_marker_m, speed_mps,
-        )  # fmt: skip
+        given = ControlInput(
+            pose, jnp.asarray(True), steering_rad, dt_s, jnp.asarray(False), to_marker_m, speed_mps
+        )
+        state, command, _, _ = control(control.init(), given)
         return command.steering_rad + command.throttle + state.explored_s
 
     for to_marker in (polar(2.0, 20.0), (0.0, 0.0), (-1.0, 0.0)):

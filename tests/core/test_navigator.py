@@ -14,14 +14,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from jaxnav.core.filter.bank import PoseBelief
-from jaxnav.core.filter.choose import PaperCost, PoseMeasurement, Selection
+from jaxnav.core.filter.choose import MeasuredPose, PaperCost, Selection
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator, Output, State
-from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.sim.regimes import step_by_regime
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
@@ -412,7 +412,7 @@ class EachItsOwn(eqx.Module):
         Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(candidates.T_vehicle_world)
         log_weight = prior.log_weight - jnp.where(valid, cost, 20.0) / 2
         return Selection(
-            measured=PoseMeasurement(
+            measured=MeasuredPose(
                 jaxlie.SE3(Ts_world_vehicle.wxyz_xyz[:2]),
                 candidates.covariance[:2],
                 jnp.where(valid, -cost / 2, 0),

@@ -19,7 +19,9 @@ from tests.derivatives import check_derivatives
 
 DIFFERENTIAL = TwistBase.create(0.8, 3.0, 0.1)
 OMNI = TwistBase.create(0.8, 3.0, 0.1, left_limit_mps=0.3)
-call = eqx.filter_jit(lambda controller, *args, **named: controller(*args, **named))
+call = eqx.filter_jit(
+    lambda controller, state, *args, **named: controller(state, ControlInput(*args, **named))
+)
 
 
 def controller(base, waypoints_m=((2.0, 0.0),)) -> TwistController:
@@ -54,10 +56,11 @@ def driven(control, base, poses, decided=True, marker_m=None):
                 away, psi = marker_m - car.pose[:2], car.pose[2]
                 c, s = jnp.cos(psi), jnp.sin(psi)
                 to_marker_m = jnp.stack([c * away[0] + s * away[1], c * away[1] - s * away[0]])
-            state, command, done, _ = control(
-                state, car.pose, jnp.asarray(True), jnp.zeros(()), jnp.asarray(0.03),
+            given = ControlInput(
+                car.pose, jnp.asarray(True), jnp.zeros(()), jnp.asarray(0.03),
                 jnp.asarray(decided), to_marker_m,
             )  # fmt: skip
+            state, command, done, _ = control(state, given)
             car = move_base(base, car, command, jnp.asarray(0.03))
             return (car, state), (car.pose, done)
 

@@ -13,7 +13,7 @@ from jaxnav.core.filter.bank import Bank, Rejections
 from jaxnav.core.filter.errors import Repeats
 from jaxnav.core.filter.estimate import Belief
 from jaxnav.core.navigator import Output
-from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections

@@ -20,8 +20,9 @@ from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
 from jaxnav.detection.acquire import acquire_in_photograph
 from jaxnav.errors import BadInput

@@ -32,42 +32,35 @@ from jaxnav.core.models.geometry import (
     safe_norm,
     wrap_angle,
 )
-from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Snapshot, log_sigmas
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.core.pose.residuals import e2
 
 
-class PoseMeasurement(eqx.Module):
-    """The pose that each hypothesis takes as measured; finite numbers where `valid` is False."""
+class MeasuredPose(eqx.Module):
+    """The pose that each hypothesis takes: a candidate as measured, or one corrected already.
 
-    T_world_vehicle: jaxlie.SE3  # batch axis (K,)
-    covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    log_misfit: Float[Array, "*K"]  # log p(residuals at the pose), up to a constant
-    valid: Bool[Array, "*K"]
-
-
-class PosePosterior(eqx.Module):
-    """The corrected pose of each hypothesis: prediction and corners fused by the selector.
-
-    The filter adopts it and corrects the rest of its state by regression (`follow_pose`).
-    Lanes where `valid` is False hold finite numbers.
+    A candidate is fused with the prediction by the filter (Eqs. 10, 11). A pose with an
+    `innovation` is prediction and corners fused by the selector: the filter adopts it and corrects
+    the rest of its state by regression. Lanes where `valid` is False hold finite numbers.
     """
 
     T_world_vehicle: jaxlie.SE3  # batch axis (K,)
     covariance: Float[Array, "*K 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    innovation: Float[Array, "*K d"]  # of the corners, whitened: its square is the NIS
+    # Up to a constant: of the residuals at a candidate, or of the corners given the prediction.
+    log_likelihood: Float[Array, "*K"]
+    valid: Bool[Array, "*K"]
+    innovation: Float[Array, "*K d"] | None = None  # of the corners, whitened: squared, the NIS
     # Factor on the covariance. The gate admits a NIS up to inflation * gate_nis; above gate_nis it
     # is counted as a rejection all the same.
-    inflation: Float[Array, "*K"]
-    log_likelihood: Float[Array, "*K"]  # of the corners given the prediction, up to a constant
-    valid: Bool[Array, "*K"]
-    errors: ErrorsPosterior | None = None
+    inflation: Float[Array, "*K"] | None = None
+    errors: ErrorsPosterior | None = None  # of the cameras, where the filter keeps any
 
 
 class Selection(eqx.Module):
     """The decision of a selector about K hypotheses and N candidates."""
 
-    measured: PoseMeasurement | PosePosterior
+    measured: MeasuredPose
     kept: Bool[Array, " K"]  # False: this hypothesis is given up, or starts anew from `measured`
     log_weight: Float[Array, " K"]  # after this observation
     heir: Int[Array, " K"]  # the hypothesis into which this one merges; its own index: none
@@ -289,7 +282,7 @@ def _cheapest(
     any_valid = jnp.any(candidates.valid) & accepted
     T_vehicle_world = jax.tree.map(lambda leaf: leaf[cheapest], candidates.T_vehicle_world)
     return Selection(
-        measured=PoseMeasurement(
+        measured=MeasuredPose(
             jaxlie.SE3(T_vehicle_world.inverse().wxyz_xyz[None]),
             candidates.covariance[cheapest][None],
             (-misfit / 2 - log_sigmas(snapshot.seen))[None],

@@ -55,8 +55,8 @@ from jaxnav.core.linalg.small_matrices import (
 from jaxnav.core.models.geometry import safe_norm, safe_sqrt, transform_points
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Sightings, Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.core.pose.residuals import (
     CameraSlopes,
     Nuisance,
@@ -74,15 +74,20 @@ def ridge(dtype: DTypeLike) -> Float[Array, ""]:
 
 
 class ErrorsPosterior(eqx.Module):
-    """The errors of the cameras in view, given the corrected pose: N(mean + slope xi, covariance).
+    """The errors of the cameras in view, given the pose: N(mean + slope d, covariance).
 
-    xi is the pose's error in the corrected pose's own axes, along its freedom.
+    d is how far the pose is off, along its freedom: in its own axes, once it is corrected.
     """
 
-    change: Float[Array, "*K t"]  # of the mean, at the corrected pose
+    change: Float[Array, "*K t"]  # of the mean, at the pose
     slope: Float[Array, "*K t d"]
     covariance: Float[Array, "*K t t"]
     rows: Float[Array, "*K t e"]  # selects them among all cameras' errors; zero: not in view
+
+    def given_pose(self, du: Float[Array, " d"], by_xi: Float[Array, "d d"]) -> "ErrorsPosterior":
+        """The errors of one hypothesis at u + du, by the pose's error there: by_xi is du / dxi."""
+        change = self.change + matvec(self.slope, du)
+        return ErrorsPosterior(change, product(self.slope, by_xi), self.covariance, self.rows)
 
 
 class ErrorsInView(eqx.Module):
@@ -128,7 +133,7 @@ class ErrorsInView(eqx.Module):
     def nuisance(self, places: Nuisance) -> Nuisance:
         """w, which moves the residuals, the places eliminated, by slopes' root w."""
         slopes = places.eliminated(self.slopes[..., None])[..., 0]
-        return Nuisance.of(self._moved(self.root, slopes)[:, :, None])
+        return Nuisance.from_slopes(self._moved(self.root, slopes)[:, :, None])
 
     def offset(self) -> Float[Array, "m K"]:
         """By how much the mean moves the residuals."""
@@ -161,7 +166,7 @@ def common_turn(errors: ErrorsPosterior, sigma_rad: Float[Array, "C 3"]) -> Floa
     return (turns[:, :, None] * jnp.eye(EACH, dtype=turns.dtype)[None]).reshape(-1, EACH)
 
 
-def not_told(
+def schmidt_update_along(
     directions: Float[Array, "e u"],
     before: Float[Array, "n n"],
     correction: Float[Array, " n"],
@@ -189,27 +194,6 @@ def times(A: Float[Array, "n m K"], B: Float[Array, "k m K"]) -> Float[Array, "n
     return jnp.sum(A[:, None] * B[None], axis=2)
 
 
-class ErrorsAtBest(eqx.Module):
-    """The cameras' errors q in view at a pose u: N(change + slope du, covariance) about the mean.
-
-    Leading axis (K,) of every leaf.
-    """
-
-    change: Float[Array, "*K t"]
-    slope: Float[Array, "*K t d"]
-    covariance: Float[Array, "*K t t"]
-    rows: Float[Array, "*K t e"]
-
-    def given_pose(self, du: Float[Array, " d"], by_xi: Float[Array, "d d"]) -> ErrorsPosterior:
-        """The errors of one hypothesis at u + du, by the pose's error there: by_xi is du / dxi."""
-        return ErrorsPosterior(
-            self.change + matvec(self.slope, du),
-            product(self.slope, by_xi),
-            self.covariance,
-            self.rows,
-        )
-
-
 class Nuisances(eqx.Module):
     """The cameras' errors, then the vehicle's off the ground, eliminated from residuals."""
 
@@ -221,7 +205,7 @@ class Nuisances(eqx.Module):
     log_share: Float[Array, " K"]  # -log |I + J_t' J_t| / 2: what the residuals leave of the priors
 
     @staticmethod
-    def of(
+    def at_predictions(
         corners: Float[Array, "3 P K"],
         root: Float[Array, "K d d"],
         errors: CameraErrors | None,
@@ -239,7 +223,7 @@ class Nuisances(eqx.Module):
         places = cameras = in_view = vehicle = None
         if moves is not None and errors is not None:
             in_view = ErrorsInView.beside(root, prior.freedom, errors, moves)
-            places = Nuisance.of(moves.places[..., None])
+            places = Nuisance.from_slopes(moves.places[..., None])
             cameras = in_view.nuisance(places)
         elif moves is not None:
             cameras = moves.nuisance()
@@ -250,7 +234,7 @@ class Nuisances(eqx.Module):
             tilts = places.eliminated(tilts)
         if tilts.shape[0]:
             left = tilts if cameras is None else cameras.eliminated(tilts)
-            vehicle = Nuisance.of(left[:, :, None])
+            vehicle = Nuisance.from_slopes(left[:, :, None])
         shares = [part.log_share for part in (places, cameras, vehicle) if part is not None]
         return Nuisances(
             places, cameras, in_view, vehicle, tilts, sum(shares, jnp.zeros_like(corners[0, 0]))
@@ -270,7 +254,7 @@ class Nuisances(eqx.Module):
 
     def errors_at_best(
         self, u: Float[Array, "d K"], r: Float[Array, "m K"], J: Float[Array, "d m K"]
-    ) -> ErrorsAtBest | None:
+    ) -> ErrorsPosterior | None:
         """The cameras' errors that explain residuals r + J du at u + du best.
 
         With A = I + S' S of the cameras, T the vehicle's slopes and D = I + T' (I + S S')^-1 T,
@@ -302,7 +286,7 @@ class Nuisances(eqx.Module):
         covariance = times(times(L, covariance), L)
         rows = jnp.broadcast_to(in_view.rows, (w.shape[1], *in_view.rows.shape))
         change, slope, covariance = (jnp.moveaxis(x, -1, 0) for x in (change, slope, covariance))
-        return ErrorsAtBest(change, slope, covariance, rows)
+        return ErrorsPosterior(change, slope, covariance, rows)
 
 
 _UNEXPLAINED = 2  # of a sighting's eight numbers: a pose has six
@@ -333,11 +317,6 @@ class RepeatedErrors(eqx.Module):
     most_share: Float[Array, ""] | float = 0.1
     # By which corners have moved when 1 / e of their errors is the same.
     renewal_px: Float[Array, ""] | float = 40.0
-
-    @staticmethod
-    def of(hypotheses: int) -> "RepeatedErrors | None":
-        """The default; None for a single hypothesis, which doubts nothing."""
-        return RepeatedErrors() if hypotheses > 1 else None
 
     def begin(self, rig: CameraRig, markers: MarkerMap) -> Repeats:
         """Nothing was seen yet."""

@@ -12,7 +12,8 @@ from jaxnav.core.filter.bank import Bank, heaviest, mixture_log_mean
 from jaxnav.core.filter.choose import Selection
 from jaxnav.core.filter.errors import Repeats
 from jaxnav.core.filter.motion import BankUpdate, Motion
-from jaxnav.core.pose.candidates import Candidates, ConsistentSnapshot
+from jaxnav.core.pose.candidates import ConsistentSnapshot
+from jaxnav.core.pose.refine import Candidates
 
 
 class Belief(eqx.Module):
@@ -49,36 +50,6 @@ class Belief(eqx.Module):
         return replace(self, bank=bank, decided=decided, flip_probability=flip_probability)
 
 
-class BeliefReport(eqx.Module):
-    """The reported part of a belief: pose and covariance of its heaviest hypothesis."""
-
-    pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
-    pose_covariance: Float[Array, "3 3"]
-    velocity: Float[Array, " 3"]  # v_x_mps, v_y_mps, psi_dot_radps in the world
-    velocity_covariance: Float[Array, "3 3"]
-    covariance: Float[Array, "d d"]  # of the state's error: (6, 6) for a car, see the motion model
-    T_world_vehicle: jaxlie.SE3
-    located: Bool[Array, ""]  # False until the first pose was taken
-    hypothesis: Int[Array, ""]  # number of the reported one, kept while it survives
-    flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
-    decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
-
-    @staticmethod
-    def of(motion: Motion, belief: Belief) -> "BeliefReport":
-        """The heaviest hypothesis; its covariance is the bank's second moment about its mean."""
-        bank, best = belief.bank, heaviest(belief.bank)
-        covariance = motion.error_covariance(bank, best)
-        return BeliefReport(
-            **motion.planar(bank.mean[best], covariance)._asdict(),
-            covariance=covariance[: motion.states, : motion.states],
-            T_world_vehicle=motion.T_world_vehicle(bank.mean[best]),
-            located=bank.initialised[best],
-            hypothesis=bank.number[best],
-            flip_probability=belief.flip_probability,
-            decided=belief.decided & bank.initialised[best],
-        )
-
-
 class Evidence(eqx.Module):
     """Candidates, costs and gate of one observation's corners."""
 
@@ -98,7 +69,7 @@ class Evidence(eqx.Module):
         return self.accepted & (self.nis <= self.gate_nis)
 
     @staticmethod
-    def of(
+    def from_update(
         seen: ConsistentSnapshot,
         prior: Bank,
         selection: Selection,
@@ -141,13 +112,38 @@ class Evidence(eqx.Module):
         )
 
 
-class Estimate(BeliefReport, Evidence):
-    """All that is known after one observation: the belief's report and the corners' evidence."""
+class Estimate(Evidence):
+    """All that is known after one observation: the belief's report and the corners' evidence.
+
+    The report is of the heaviest hypothesis; its covariance is the bank's second moment about it.
+    """
+
+    pose: Float[Array, " 3"]  # x_m, y_m, psi_rad in the world
+    pose_covariance: Float[Array, "3 3"]
+    velocity: Float[Array, " 3"]  # v_x_mps, v_y_mps, psi_dot_radps in the world
+    velocity_covariance: Float[Array, "3 3"]
+    covariance: Float[Array, "d d"]  # of the state's error: (6, 6) for a car, see the motion model
+    T_world_vehicle: jaxlie.SE3
+    located: Bool[Array, ""]  # False until the first pose was taken
+    hypothesis: Int[Array, ""]  # number of the reported one, kept while it survives
+    flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
+    decided: Bool[Array, ""]  # False: several poses are still possible, and none is acted upon
 
     @staticmethod
-    def of(motion: Motion, belief: Belief, evidence: Evidence) -> "Estimate":  # type: ignore[override]
+    def from_belief(motion: Motion, belief: Belief, evidence: Evidence) -> "Estimate":
         """The estimate of a belief and of the evidence that led to it."""
-        return Estimate(**vars(BeliefReport.of(motion, belief)), **vars(evidence))
+        bank, best = belief.bank, heaviest(belief.bank)
+        covariance = motion.error_covariance(bank, best)
+        return Estimate(
+            **vars(evidence),
+            **motion.planar(bank.mean[best], covariance)._asdict(),
+            covariance=covariance[: motion.states, : motion.states],
+            T_world_vehicle=motion.T_world_vehicle(bank.mean[best]),
+            located=bank.initialised[best],
+            hypothesis=bank.number[best],
+            flip_probability=belief.flip_probability,
+            decided=belief.decided & bank.initialised[best],
+        )
 
     @property
     def evidence(self) -> Evidence:

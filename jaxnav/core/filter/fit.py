@@ -21,8 +21,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.filter.bank import CameraErrors, PoseBelief
-from jaxnav.core.filter.choose import PosePosterior
-from jaxnav.core.filter.errors import ErrorsAtBest, Nuisances
+from jaxnav.core.filter.choose import MeasuredPose
+from jaxnav.core.filter.errors import ErrorsPosterior, Nuisances
 from jaxnav.core.linalg.levenberg_marquardt import (
     ImplicitGradient,
     NormalEquations,
@@ -52,7 +52,7 @@ from jaxnav.core.pose.residuals import answers, cross_product, reprojection_rows
 class PoseFit(eqx.Module):
     """The minimum of e next to each of K predictions."""
 
-    posterior: PosePosterior
+    posterior: MeasuredPose
     cost: Float[Array, "*K"]  # |r|^2 / sigma^2 at the minimum
     log_evidence: Float[Array, "*K"]
     finite: Bool[Array, "*K"]
@@ -96,7 +96,7 @@ def fit_poses(
     root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
     spread = jax.vmap(lambda L: product(freedom, L))(root)
     corners = _corners(T_world_prior, snapshot)
-    beside = Nuisances.of(corners, root, errors, prior, snapshot)
+    beside = Nuisances.at_predictions(corners, root, errors, prior, snapshot)
     linearised = _linearised(corners, jnp.moveaxis(spread, 0, -1), beside, snapshot)
 
     def with_prediction(u: Array, _: None) -> tuple[Any, NormalEquations]:
@@ -215,7 +215,7 @@ def _fused(
     information: Float[Array, "d d"],
     log_share: Float[Array, ""],
     log_scale: Float[Array, ""],
-    errors: ErrorsAtBest | None,
+    errors: ErrorsPosterior | None,
     *,
     freedom: Float[Array, "6 d"],
     floor: Float[Array, " 6"],
@@ -260,14 +260,14 @@ def _fused(
     numbers = [T.wxyz_xyz, posterior_covariance.reshape(-1), log_evidence[None], contradiction]
     finite = usable & jnp.all(jnp.isfinite(jnp.concatenate(numbers)))
     return PoseFit(
-        posterior=PosePosterior(
+        posterior=MeasuredPose(
             jaxlie.SE3(jnp.where(finite, T.wxyz_xyz, T_world_prior.wxyz_xyz)),
             jnp.where(finite, posterior_covariance, jnp.eye(6, dtype=dtype)),
-            jnp.where(finite, contradiction, jnp.inf),
-            jnp.ones((), dtype),
             jnp.where(finite, log_likelihood, 0),
             finite,
-            jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0), errors_in_view),
+            innovation=jnp.where(finite, contradiction, jnp.inf),
+            inflation=jnp.ones((), dtype),
+            errors=jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0), errors_in_view),
         ),
         cost=jnp.where(finite, jnp.where(linear, misfit, cost), jnp.inf),
         log_evidence=jnp.where(finite, log_evidence, -jnp.inf),

@@ -17,14 +17,13 @@ from jaxnav.core.filter.bank import (
     Moments,
     Offer,
     PoseBelief,
-    contradicted,
     empty_bank,
     forget_lost,
     heaviest,
     known_to,
 )
-from jaxnav.core.filter.choose import PoseMeasurement, PosePosterior
-from jaxnav.core.filter.errors import EACH, common_turn, not_told
+from jaxnav.core.filter.choose import MeasuredPose
+from jaxnav.core.filter.errors import EACH, common_turn, schmidt_update_along
 from jaxnav.core.filter.motion import Motion, camera_states, follow_pose
 from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, where
 from jaxnav.core.models.geometry import (
@@ -48,15 +47,19 @@ class FreeBody(Motion):
     xi in `T_world_vehicle * cay(xi)`, and the errors of all others.
     """
 
-    acceleration_density: eqx.AbstractVar[Float[Array, " 6"] | Float[Array, "6 6"]]
-    vision_floor: eqx.AbstractVar[Float[Array, " 6"] | Float[Array, "6 6"]]
-    camera_states: eqx.AbstractVar[int]
-    camera_turn_sigma_rad: eqx.AbstractVar[Float[Array, "C 3"] | None]
-    learn_sigma_rad: eqx.AbstractVar[float]
-    lost_sigma_m: eqx.AbstractVar[float]
-    gate_nis: eqx.AbstractVar[float]
-    max_rejections: eqx.AbstractVar[int]
-    max_rejected_s: eqx.AbstractVar[float]
+    acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3), kw_only=True
+    )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times; or the matrix
+    vision_floor: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([0.002] * 3 + [0.002] * 3), kw_only=True
+    )  # standard deviations, m and rad; or their covariance
+    initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
+        default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3), kw_only=True
+    )  # m/s and rad/s
+    camera_turn_sigma_rad: Float[Array, "C 3"] | None = eqx.field(default=None, kw_only=True)
+    # A hypothesis whose position is less certain is forgotten.
+    lost_sigma_m: float = eqx.field(default=0.5, kw_only=True)
+    gate_nis: float = eqx.field(default=27.9, kw_only=True)  # chi-square, 6 dof, at 99.99 %
 
     @abc.abstractmethod
     def at_first(self) -> Moments:
@@ -83,10 +86,6 @@ class FreeBody(Motion):
         lost = self.lost(before) | ~(variance_m2 < self.lost_sigma_m**2)
         return forget_lost(bank, lost, dt_s)
 
-    def lost(self, bank: Bank) -> Bool[Array, " K"]:
-        """Whether the gate has contradicted a hypothesis too often or too long."""
-        return contradicted(bank, self.max_rejections, self.max_rejected_s)
-
     def poses(self, bank: Bank) -> PoseBelief:
         """The pose part of the state: free in six directions, without nuisances."""
         return PoseBelief(
@@ -107,8 +106,10 @@ class FreeBody(Motion):
         behind = P.shape[-1] - self.camera_states
         return CameraErrors(bank.mean[:, behind + 1 :], P[:, behind:, behind:], P[:, :6, behind:])
 
-    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has chosen a candidate, in 6 dof."""
+    def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """One hypothesis as a pose makes of it, in 6 dof; see `Motion`."""
+        if measured.innovation is not None:
+            return self._adopted(bank, measured)
         mean, P = bank.mean, bank.covariance
         log_volume = log_det(cholesky(measured.covariance)) / 2
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
@@ -117,12 +118,14 @@ class FreeBody(Motion):
         return Offer(
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
-            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
+            log_likelihood=measured.log_likelihood
+            + log_volume
+            + kalman.log_likelihood(innovation, S),
             posterior=(self.moved(mean, correction), posterior),
         )
 
-    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has corrected its pose, in 6 dof."""
+    def _adopted(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """The same, of a pose that the selector has corrected by the corners."""
         T = measured.T_world_vehicle
         correction, P = follow_pose(
             bank.covariance,
@@ -134,7 +137,7 @@ class FreeBody(Motion):
         if measured.errors is not None and self.camera_turn_sigma_rad is not None:
             sigma_rad = jnp.asarray(self.camera_turn_sigma_rad, P.dtype)
             common = common_turn(measured.errors, sigma_rad)
-            correction, P = not_told(common, bank.covariance, correction, P)
+            correction, P = schmidt_update_along(common, bank.covariance, correction, P)
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
@@ -182,21 +185,18 @@ class FreeBody(Motion):
         variance = jnp.trace(bank.covariance[:, 3:6, 3:6], axis1=1, axis2=2)
         return known_to(bank, apart, variance) < self.learn_sigma_rad**2
 
-    def start(
-        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
-    ) -> Moments:
+    def start(self, bank: Bank, measured: MeasuredPose, obs: Observation) -> Moments:
         """One hypothesis that begins at a measured pose, moving as little as is known."""
         wxyz_xyz, dtype = measured.T_world_vehicle.wxyz_xyz, bank.mean.dtype
-        covariance, errors = measured.covariance, None
-        if isinstance(measured, PosePosterior):
-            errors = measured.errors
-        else:
+        covariance = measured.covariance
+        if measured.innovation is None:
             covariance = covariance + kalman.as_covariance(self.vision_floor)
         mean, of_rest = (x.astype(dtype) for x in self.at_first())
         behind = 6 + mean.shape[0]
         cameras = jnp.ones(self.camera_states, dtype)
         P = jnp.diag(jnp.concatenate([jnp.zeros(behind, dtype), cameras]))
         P = P.at[:6, :6].set(covariance).at[6:behind, 6:behind].set(of_rest)
+        errors = measured.errors
         if errors is not None:
             cross = product(covariance, product(errors.slope.T, errors.rows))
             P = P.at[:6, behind:].set(cross).at[behind:, :6].set(cross.T)
@@ -242,28 +242,12 @@ class ConstantVelocity(FreeBody):
     """
 
     states: ClassVar[int] = 12
-    acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
-        default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3)
-    )  # (m/s^2)^2/Hz three times, (rad/s^2)^2/Hz three times; or the matrix
-    vision_floor: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
-        default_factory=lambda: jnp.asarray([0.002] * 3 + [0.002] * 3)
-    )  # standard deviations, m and rad; or their covariance
-    initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
-        default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
-    )  # m/s and rad/s
     # Random walk of the odometry along each axis: per way, per angle, and twice per time;
     # m/sqrt(m), rad/sqrt(rad), m/sqrt(s), rad/sqrt(s).
     odometry_drift: Float[Array, " 4"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.04, 0.02, 0.005, 0.005])
     )
     odometry_errors: OdometryErrors | None = None  # None: white noise is all that it gets wrong
-    camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
-    camera_turn_sigma_rad: Float[Array, "C 3"] | None = None  # see `for_rig`
-    learn_sigma_rad: float = 0.035  # sigma of the orientation below which errors are estimated
-    lost_sigma_m: float = 0.5  # a hypothesis whose position is less certain is forgotten
-    gate_nis: float = 27.9  # chi-square with 6 dof at 99.99 %; inf: no gate
-    max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
-    max_rejected_s: float = 7.0  # of rejections, whether they agree or not: forgotten
 
     def predict(self, bank: Bank, obs: Observation) -> Bank:
         """T = T exp(u dt),  P = F P F' + Q.

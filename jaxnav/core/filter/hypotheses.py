@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.core.filter.bank import EVEN_LOG_WEIGHT, PoseBelief, excess_of, find_heirs, normalise
-from jaxnav.core.filter.choose import PosePosterior, Selection
+from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.fit import PoseFit, fit_poses
 from jaxnav.core.linalg.levenberg_marquardt import mark_found
 from jaxnav.core.linalg.small_matrices import (
@@ -53,8 +53,9 @@ from jaxnav.core.models.geometry import (
     shift_and_turn,
     wrap_angle,
 )
-from jaxnav.core.pose.candidates import SAME_POSE_RAD, Candidates
+from jaxnav.core.pose.candidates import SAME_POSE_RAD
 from jaxnav.core.pose.observation import Snapshot
+from jaxnav.core.pose.refine import Candidates
 
 
 def nearer_to_another(
@@ -101,17 +102,10 @@ def beyond(
 
 
 class SecondPoses(NamedTuple):
-    """The candidates that one predicted hypothesis may have meant as well."""
+    """Candidates that a predicted hypothesis may have meant too, or the slots that take them."""
 
     wanted: Bool[Array, " N"]
-    xi: Float[Array, "N d"]  # along `freedom`, from the prediction
-
-
-class Branches(NamedTuple):
-    """The empty slots that take a candidate."""
-
-    taken: Bool[Array, " K"]
-    xi: Float[Array, "K d"]  # along `freedom`, from the prediction; 0 where none is taken
+    xi: Float[Array, "N d"]  # along `freedom`, from the prediction; 0 in a slot that takes none
 
 
 def second_poses(
@@ -156,13 +150,13 @@ def second_poses(
     return SecondPoses(probable & ~nearest & bank.initialised[index], xi)
 
 
-def give_slots(second: SecondPoses, empty: Bool[Array, " K"]) -> Branches:
+def give_slots(second: SecondPoses, empty: Bool[Array, " K"]) -> SecondPoses:
     """Each second pose in an empty slot of its own, as long as there are any."""
     wanted = second.wanted
     in_order = jnp.cumsum(empty)[:, None] == jnp.cumsum(wanted)[None]
     taken = in_order & empty[:, None] & wanted[None]
     xi = jnp.sum(jnp.where(taken[..., None], second.xi[None], 0), axis=1)
-    return Branches(jnp.any(taken, axis=1), xi)
+    return SecondPoses(jnp.any(taken, axis=1), xi)
 
 
 CANDIDATES = 3  # largest number of candidates beside the fan
@@ -370,7 +364,7 @@ class MultiHypothesis(eqx.Module):
             snapshot: the observation with its rig and map.
 
         Returns:
-            A `PosePosterior` for each hypothesis, with weights, heirs and `decided`.
+            A `MeasuredPose` for each hypothesis, with weights, heirs and `decided`.
         """
         any_seen = jnp.any(snapshot.seen.visible)
         snapshot = self._trusted(snapshot, candidates)
@@ -384,13 +378,14 @@ class MultiHypothesis(eqx.Module):
         heaviest = first_highest(alive_before, EVEN_LOG_WEIGHT)
         own = jnp.arange(count)
         does_as = jnp.where(bank.initialised, own, heaviest)
-        predicted = _at(_poses(bank), does_as)
+        predicted, of_errors = jax.tree.map(
+            lambda leaf: leaf[does_as], ((bank.T_world_vehicle, bank.covariance), bank.errors)
+        )
         second = self.second_poses(bank, heaviest, candidates, snapshot)
         tried = give_slots(second, ~bank.initialised & ~starts)
         fits = fit_poses(
-            predicted.T_world_vehicle,
-            predicted.covariance,
-            jax.tree.map(lambda leaf: leaf[does_as], bank.errors),
+            *predicted,
+            of_errors,
             prior,
             snapshot,
             floor,
@@ -408,9 +403,9 @@ class MultiHypothesis(eqx.Module):
         log_weight = jnp.where(alive, bank.log_weight + evidence, -jnp.inf)
 
         # A second posterior shares its parent's prediction, and is no surer of it than the parent.
-        branches = tried.taken & fits.finite & passes & fits_one & alive[does_as]
-        fitted = _poses(fits.posterior).T_world_vehicle
-        of_parent = _at(_poses(fits.posterior), does_as).T_world_vehicle
+        branches = tried.wanted & fits.finite & passes & fits_one & alive[does_as]
+        fitted = fits.posterior.T_world_vehicle
+        of_parent = jaxlie.SE3(fitted.wxyz_xyz[does_as])
         branches = branches & (jax.vmap(rotation_error_rad)(fitted, of_parent) > self.linear_rad)
         lighter = jnp.minimum(log_evidence - log_evidence[does_as], -2 * EVEN_LOG_WEIGHT)
         log_weight = jnp.where(branches, log_weight[does_as] + lighter, log_weight)
@@ -418,11 +413,12 @@ class MultiHypothesis(eqx.Module):
         alive = (alive | branches) & (log_weight > self.forget_log_weight)
 
         # A hypothesis whose pose the gate rejects stays where it was predicted.
-        after = where(passes, _poses(posteriors), predicted)
+        corrected = posteriors.T_world_vehicle, posteriors.covariance
+        T_after, P_after = where(passes, corrected, predicted)
         best = first_highest(log_weight, EVEN_LOG_WEIGHT)
-        T_best = _at(after, best).T_world_vehicle
-        apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(after.T_world_vehicle)
-        sigmas_rad = safe_sqrt(jnp.trace(after.covariance[:, 3:, 3:], axis1=1, axis2=2))
+        T_best = jaxlie.SE3(T_after.wxyz_xyz[best])
+        apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(T_after)
+        sigmas_rad = safe_sqrt(jnp.trace(P_after[:, 3:, 3:], axis1=1, axis2=2))
         mass = jnp.where(alive, jnp.exp(log_weight), 0)
         far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
         known_rad = safe_sqrt(jnp.sum(mass * (sigmas_rad**2 + apart_rad**2)))
@@ -436,7 +432,7 @@ class MultiHypothesis(eqx.Module):
             # Candidates of a spoilt frame are of no branch.
             jnp.where(
                 fits_one,
-                nearer_to_another(after.T_world_vehicle, after.covariance, candidates, nearest),
+                nearer_to_another(T_after, P_after, candidates, nearest),
                 0,
             ),
         )
@@ -447,10 +443,10 @@ class MultiHypothesis(eqx.Module):
             heir = jax.lax.cond(
                 jnp.sum(alive) > 1,
                 lambda: find_heirs(
-                    after.T_world_vehicle,
-                    after.covariance,
+                    T_after,
+                    P_after,
                     jnp.where(alive, log_weight, -jnp.inf),
-                    self._linear(after.T_world_vehicle, snapshot),
+                    self._linear(T_after, snapshot),
                     prior.freedom,
                     self.merge_distance,
                 ),
@@ -550,11 +546,11 @@ def _log_evidence(fits: PoseFit, inflation: Float[Array, ""]) -> Float[Array, " 
     return fits.log_evidence + forgiven
 
 
-def _nis(posteriors: PosePosterior) -> Float[Array, " K"]:
+def _nis(posteriors: MeasuredPose) -> Float[Array, " K"]:
     return jnp.sum(posteriors.innovation**2, axis=1)
 
 
-def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePosterior:
+def _inflated(posteriors: MeasuredPose, inflation: Float[Array, ""]) -> MeasuredPose:
     return eqx.tree_at(
         lambda p: (p.covariance, p.inflation),
         posteriors,
@@ -562,7 +558,7 @@ def _inflated(posteriors: PosePosterior, inflation: Float[Array, ""]) -> PosePos
     )
 
 
-def _contradicted(posteriors: PosePosterior, excess: Float[Array, " K"]) -> PosePosterior:
+def _contradicted(posteriors: MeasuredPose, excess: Float[Array, " K"]) -> MeasuredPose:
     """The posteriors with a NIS of at least their excess cost over the best candidate.
 
     Where residuals are linear the NIS is that excess, plus what the prediction pays. In the wrong
@@ -579,17 +575,3 @@ def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
     cost = candidates.least_cost
     freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
     return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
-
-
-class _Poses(eqx.Module):
-    T_world_vehicle: jaxlie.SE3  # batch axis (K,)
-    covariance: Float[Array, "*K 6 6"]
-
-
-def _poses(of: PoseBelief | PosePosterior) -> _Poses:
-    return _Poses(of.T_world_vehicle, of.covariance)
-
-
-def _at(poses: _Poses, index: Int[Array, "*rows"]) -> _Poses:
-    chosen: _Poses = jax.tree.map(lambda leaf: leaf[index], poses)
-    return chosen

@@ -55,22 +55,6 @@ class InertialMotion(FreeBody):
     still_sigma: Float[Array, " 6"] = eqx.field(
         default_factory=lambda: jnp.asarray([0.01] * 3 + [0.005] * 3)
     )  # m/s and rad/s of a body that its IMU finds at rest
-    acceleration_density: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
-        default_factory=lambda: jnp.asarray([1.0**2] * 3 + [2.0**2] * 3)
-    )  # without the IMU; as `ConstantVelocity`, and so are all below
-    vision_floor: Float[Array, " 6"] | Float[Array, "6 6"] = eqx.field(
-        default_factory=lambda: jnp.asarray([0.002] * 3 + [0.002] * 3)
-    )
-    initial_velocity_sigma: Float[Array, " 6"] = eqx.field(
-        default_factory=lambda: jnp.asarray([1.0] * 3 + [1.0] * 3)
-    )
-    camera_states: int = eqx.field(static=True, default=0)
-    camera_turn_sigma_rad: Float[Array, "C 3"] | None = None
-    learn_sigma_rad: float = 0.035
-    lost_sigma_m: float = 0.5
-    gate_nis: float = 27.9
-    max_rejections: int = eqx.field(static=True, default=10)
-    max_rejected_s: float = 7.0
 
     @staticmethod
     def in_any_world(noise: ImuNoise = CONSUMER, **fields: object) -> "InertialMotion":
@@ -184,7 +168,7 @@ class InertialMotion(FreeBody):
             log_likelihood = kalman.log_likelihood(mean[7:13], S)
             after = self.moved(mean, correction), posterior
             # It tells nothing of the cameras.
-            after = self.considered(jnp.asarray(False), (mean, P), after)
+            after = self.schmidt_update(jnp.asarray(False), (mean, P), after)
             mean, P = where(taken, after, (mean, P))
             return mean, P, taken, log_likelihood
 

@@ -29,10 +29,11 @@ from jaxnav.core.filter.bank import (
     PoseBelief,
     apply_gate,
     branched,
+    contradicted,
     merge_heirs,
     restart_broken,
 )
-from jaxnav.core.filter.choose import PoseMeasurement, PosePosterior, Selection
+from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.errors import EACH, ridge
 from jaxnav.core.linalg.small_matrices import (
     cholesky,
@@ -51,7 +52,7 @@ from jaxnav.core.pose.observation import Observation
 def follow_pose(
     P: Float[Array, "n n"],
     T_world_prior: jaxlie.SE3,
-    posterior: PosePosterior,
+    posterior: MeasuredPose,
     freedom: Float[Array, "6 d"],
     states: int,
     behind: int = 0,
@@ -138,6 +139,12 @@ class Motion(eqx.Module):
     """Base class of the motion models: the abstract methods differ, the others are shared."""
 
     states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
+    gate_nis: eqx.AbstractVar[float]  # a larger NIS contradicts a hypothesis; inf: no gate
+    camera_states: int = eqx.field(static=True, default=0, kw_only=True)  # see `for_rig`
+    # Sigma of the orientation below which the errors of sensors and cameras are estimated.
+    learn_sigma_rad: float = eqx.field(default=0.035, kw_only=True)
+    max_rejections: int = eqx.field(static=True, default=10, kw_only=True)  # that agree: forgotten
+    max_rejected_s: float = eqx.field(default=7.0, kw_only=True)  # agree or not: forgotten
 
     @abc.abstractmethod
     def init(self, hypotheses: int = 1) -> Bank:
@@ -158,26 +165,20 @@ class Motion(eqx.Module):
         """The bank whose hypotheses that are not finite begin anew."""
         return restart_broken(bank, self.init(bank.initialised.shape[0]))
 
-    @abc.abstractmethod
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
+        return contradicted(bank, self.max_rejections, self.max_rejected_s)
 
     @abc.abstractmethod
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses, covariances and weights of the hypotheses, for a selector."""
 
     @abc.abstractmethod
-    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has chosen a candidate."""
+    def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """One hypothesis as the pose that its selector has chosen, or corrected, makes of it."""
 
     @abc.abstractmethod
-    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has corrected its pose."""
-
-    @abc.abstractmethod
-    def start(
-        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
-    ) -> Moments:
+    def start(self, bank: Bank, measured: MeasuredPose, obs: Observation) -> Moments:
         """One hypothesis that begins at a measured pose."""
 
     @abc.abstractmethod
@@ -207,7 +208,7 @@ class Motion(eqx.Module):
     def learns(self, bank: Bank) -> Bool[Array, ""]:
         """Whether the errors that are only considered at first are estimated by now."""
 
-    def considered(self, learns: Bool[Array, ""], before: Moments, after: Moments) -> Moments:
+    def schmidt_update(self, learns: Bool[Array, ""], before: Moments, after: Moments) -> Moments:
         """The posterior whose errors keep their mean and covariance unless the model `learns`.
 
         Pose and velocity are corrected by their own gain, and stay correlated with the errors.
@@ -253,13 +254,12 @@ class Motion(eqx.Module):
             lambda b: (b.log_weight, b.initialised), bank, (selection.log_weight, selection.kept)
         )
         measured = selection.measured
-        offer = self.follow if isinstance(measured, PosePosterior) else self.measure
         learns = self.learns(bank)
 
         def one(before: Bank, measured: Any, first: Moments) -> BankUpdate:
-            offered = offer(before, measured, obs)
+            offered = self.offer(before, measured)
             predicted = before.mean, before.covariance
-            posterior = self.considered(learns, predicted, offered.posterior)
+            posterior = self.schmidt_update(learns, predicted, offered.posterior)
             offered = offered._replace(posterior=posterior)
             after, nis, accepted = apply_gate(before, offered, first, measured.valid)
             compared = measured.valid & before.initialised

@@ -17,13 +17,12 @@ from jaxnav.core.filter.bank import (
     Moments,
     Offer,
     PoseBelief,
-    contradicted,
     empty_bank,
     forget_lost,
     heaviest,
     known_to,
 )
-from jaxnav.core.filter.choose import PoseMeasurement, PosePosterior
+from jaxnav.core.filter.choose import MeasuredPose
 from jaxnav.core.filter.motion import Motion, Planar, camera_states, follow_pose
 from jaxnav.core.filter.odometry import (
     GYRO,
@@ -105,11 +104,7 @@ class BicycleKalman(Motion):
     )  # before the first odometry, m/s m/s rad/s
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
-    camera_states: int = eqx.field(static=True, default=0)  # see `for_rig`
-    learn_sigma_rad: float = 0.035  # sigma of the heading below which sensor errors are estimated
     gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 %; inf: no gate
-    max_rejections: int = eqx.field(static=True, default=10)  # in a row that agree: forgotten
-    max_rejected_s: float = 7.0  # of rejections, whether they agree or not: forgotten
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
@@ -157,10 +152,6 @@ class BicycleKalman(Motion):
         dt_s = jnp.asarray(obs.dt_s, mean.dtype)
         return later, self._stepped(later, P, obs, dt_s, None if turn is None else turn.told)
 
-    def lost(self, bank: Bank) -> Bool[Array, " K"]:
-        """Whether the gate has contradicted a hypothesis too often or too long."""
-        return contradicted(bank, self.max_rejections, self.max_rejected_s)
-
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses level on the ground (Eq. 12); height, roll and pitch are nuisances with a sigma."""
         seen, slopes = jax.vmap(seen_pose)(bank.mean, bank.velocity_lead)
@@ -192,8 +183,10 @@ class BicycleKalman(Motion):
             errors,
         )
 
-    def measure(self, bank: Bank, measured: PoseMeasurement, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has chosen a candidate, in 3 dof."""
+    def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """One hypothesis as a pose makes of it, in 3 dof; see `Motion`."""
+        if measured.innovation is not None:
+            return self._adopted(bank, measured)
         P = bank.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
@@ -208,12 +201,14 @@ class BicycleKalman(Motion):
         return Offer(
             kalman.whiten(innovation, S),
             gate_nis=self.gate_nis,
-            log_likelihood=measured.log_misfit + log_volume + kalman.log_likelihood(innovation, S),
+            log_likelihood=measured.log_likelihood
+            + log_volume
+            + kalman.log_likelihood(innovation, S),
             posterior=(self.moved(bank.mean, correction), posterior),
         )
 
-    def follow(self, bank: Bank, measured: PosePosterior, obs: Observation) -> Offer:
-        """The offer to one hypothesis whose selector has corrected its pose, in 3 dof."""
+    def _adopted(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """The same, of a pose that the selector has corrected by the corners."""
         T, lead = measured.T_world_vehicle, bank.velocity_lead
         pose = planar_from_T_world_vehicle(T)
         seen, slope = seen_pose(bank.mean, lead)
@@ -278,20 +273,16 @@ class BicycleKalman(Motion):
         """Pose and velocity as they stand in the state, which is planar."""
         return Planar(mean[:3], covariance[:3, :3], mean[3:SIX], covariance[3:SIX, 3:SIX])
 
-    def start(
-        self, bank: Bank, measured: PoseMeasurement | PosePosterior, obs: Observation
-    ) -> Moments:
+    def start(self, bank: Bank, measured: MeasuredPose, obs: Observation) -> Moments:
         """One hypothesis that begins at a measured pose, moving as read, its errors unknown."""
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         covariance = planar_covariance(measured.T_world_vehicle, measured.covariance)
-        errors = None
-        if isinstance(measured, PosePosterior):
-            errors = measured.errors
-        else:
+        if measured.innovation is None:
             covariance = covariance + kalman.as_covariance(self.vision_floor)
         velocity = jnp.asarray(self.initial_velocity_sigma, pose.dtype) ** 2
         variance = jnp.concatenate([jnp.zeros(3, pose.dtype), velocity, self._error_variance()])
         P = jnp.diag(variance).at[:3, :3].set(covariance)
+        errors = measured.errors
         if errors is not None:
             # d q / d (x, y, psi) in the world, of the errors in view
             slope = product(errors.slope, planar_rotation(-pose[2]))
@@ -399,7 +390,9 @@ class BicycleKalman(Motion):
         )
         change, present = read.velocity - mean[3:SIX], _present(read, turns)
         correction, after, _ = kalman.update(P, *kalman.hide_rows(change, H, R, present))
-        return self.considered(jnp.asarray(False), (mean, P), (self.moved(mean, correction), after))
+        return self.schmidt_update(
+            jnp.asarray(False), (mean, P), (self.moved(mean, correction), after)
+        )
 
 
 def _present(read: ReadVelocity, turns: Array | None) -> Float[Array, " 3"]:

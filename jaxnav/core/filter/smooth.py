@@ -117,7 +117,7 @@ class Link(eqx.Module):
     rest: Float[Array, "*K d d"]  # D, what even an exact later state would leave
 
     @staticmethod
-    def of(motion: Motion, filtered: Moments, obs: Observation) -> "Link":
+    def from_filtered(motion: Motion, filtered: Moments, obs: Observation) -> "Link":
         """The link of one hypothesis to its prediction.
 
         Args:
@@ -159,7 +159,7 @@ def smoothed(motion: Motion, filtered: Moments, later: Moments, obs: Observation
     Returns:
         The moments at the earlier instant; the filtered ones where the later ones are not finite.
     """
-    mean, covariance = Link.of(motion, filtered, obs).back(motion, later)
+    mean, covariance = Link.from_filtered(motion, filtered, obs).back(motion, later)
     finite = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(covariance))
     return where(finite, (mean, covariance), filtered)
 
@@ -225,7 +225,7 @@ class Window(eqx.Module):
         """
         weight = jnp.where(before.initialised, before.log_weight, -jnp.inf)
         slots = in_order(weight, self.slots.shape[1]).astype(self.slots.dtype)
-        links = jax.vmap(lambda mean, P: Link.of(motion, (mean, P), obs))(
+        links = jax.vmap(lambda mean, P: Link.from_filtered(motion, (mean, P), obs))(
             before.mean[slots], before.covariance[slots]
         )
         slots = jnp.where(before.initialised[slots], slots, -1)

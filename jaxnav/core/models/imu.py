@@ -47,72 +47,6 @@ from jaxnav.core.models.geometry import rotation_matrix, safe_norm, safe_sinc, s
 _G_MPS2 = 9.80665  # standard gravity, in which data sheets count
 
 
-@dataclass(frozen=True)
-class ImuClass:
-    """Figures of one class, in the units of data sheets, alike on the three axes."""
-
-    gyro_noise_degps: float  # density, deg/s/sqrt(Hz)
-    gyro_offset_degps: float  # 1 sigma, before anything tells it
-    gyro_walk: float  # of the offset, rad/s/sqrt(s)
-    gyro_range_degps: float
-    gyro_scale: float  # tolerance of the sensitivity
-    gyro_late_s: float  # what is left of the delay
-    accel_noise_ug: float  # density, 1e-6 g/sqrt(Hz)
-    accel_offset_mg: float
-    accel_walk: float  # m/s^2/sqrt(s)
-
-    @property
-    def gyro_noise(self) -> float:
-        """Density, rad/s/sqrt(Hz)."""
-        return math.radians(self.gyro_noise_degps)
-
-    @property
-    def gyro_offset_radps(self) -> float:
-        """1 sigma."""
-        return math.radians(self.gyro_offset_degps)
-
-    @property
-    def gyro_range_radps(self) -> float:
-        """A reading at it or beyond is none."""
-        return math.radians(self.gyro_range_degps)
-
-    @property
-    def accel_noise(self) -> float:
-        """Density, m/s^2/sqrt(Hz)."""
-        return self.accel_noise_ug * 1e-6 * _G_MPS2
-
-    @property
-    def accel_offset_mps2(self) -> float:
-        """1 sigma."""
-        return self.accel_offset_mg * 1e-3 * _G_MPS2
-
-
-IMU_CLASSES = {
-    "consumer": ImuClass(
-        gyro_noise_degps=0.014,
-        gyro_offset_degps=1.0,
-        gyro_walk=2e-5,
-        gyro_range_degps=2000.0,
-        gyro_scale=0.01,
-        gyro_late_s=5e-3,
-        accel_noise_ug=175.0,  # 160 along x and y, 190 along z
-        accel_offset_mg=20.0,
-        accel_walk=3e-3,
-    ),
-    "tactical": ImuClass(
-        gyro_noise_degps=0.008,
-        gyro_offset_degps=0.2,
-        gyro_walk=4e-6,
-        gyro_range_degps=2000.0,
-        gyro_scale=0.003,
-        gyro_late_s=1e-3,
-        accel_noise_ug=100.0,
-        accel_offset_mg=10.0,
-        accel_walk=6e-4,
-    ),
-}
-
-
 class Gyro(eqx.Module):
     """Errors of a gyroscope about one axis, for a filter and for a simulation."""
 
@@ -123,22 +57,6 @@ class Gyro(eqx.Module):
     scale_sigma: Float[Array, ""] | float = 0.0  # of the error e of its scale
     delay_s: Float[Array, ""] | float = 0.0  # how much older than its stamp a reading is
     delay_sigma_s: Float[Array, ""] | float = 0.0  # of what is left of the delay
-
-
-GYROS = {
-    name: Gyro(
-        figures.gyro_noise,
-        figures.gyro_offset_radps,
-        figures.gyro_walk,
-        figures.gyro_range_radps,
-        figures.gyro_scale,
-        delay_sigma_s=figures.gyro_late_s,
-    )
-    for name, figures in IMU_CLASSES.items()
-}
-
-
-_Sums = tuple[Array, Array, Array, Array, Array]
 
 
 class ImuNoise(eqx.Module):
@@ -170,17 +88,76 @@ class ImuNoise(eqx.Module):
         return jnp.repeat(jnp.stack([jnp.asarray(sigma, float) for sigma in sigmas]) ** 2, 3)
 
 
-PRESETS = {
-    name: ImuNoise(
-        gyroscope_noise_density=figures.gyro_noise,
-        accelerometer_noise_density=figures.accel_noise,
-        gyroscope_random_walk=figures.gyro_walk,
-        accelerometer_random_walk=figures.accel_walk,
-        gyroscope_bias_sigma=figures.gyro_offset_radps,
-        accelerometer_bias_sigma=figures.accel_offset_mps2,
+def _sensors(
+    *,
+    gyro_noise_degps: float,
+    gyro_offset_degps: float,
+    gyro_walk: float,
+    gyro_range_degps: float,
+    gyro_scale: float,
+    gyro_late_s: float,
+    accel_noise_ug: float,
+    accel_offset_mg: float,
+    accel_walk: float,
+) -> tuple[Gyro, ImuNoise]:
+    """A gyro and an IMU of one class, by figures in the units of data sheets.
+
+    Args:
+        gyro_noise_degps: density, deg/s/sqrt(Hz).
+        gyro_offset_degps: 1 sigma, before anything tells it.
+        gyro_walk: of the offset, rad/s/sqrt(s).
+        gyro_range_degps: a reading at it or beyond is none.
+        gyro_scale: tolerance of the sensitivity.
+        gyro_late_s: what is left of the delay.
+        accel_noise_ug: density, 1e-6 g/sqrt(Hz).
+        accel_offset_mg: 1 sigma.
+        accel_walk: m/s^2/sqrt(s).
+    """
+    noise, offset = math.radians(gyro_noise_degps), math.radians(gyro_offset_degps)
+    gyro = Gyro(
+        noise,
+        offset,
+        gyro_walk,
+        math.radians(gyro_range_degps),
+        gyro_scale,
+        delay_sigma_s=gyro_late_s,
     )
-    for name, figures in IMU_CLASSES.items()
+    return gyro, ImuNoise(
+        gyroscope_noise_density=noise,
+        accelerometer_noise_density=accel_noise_ug * 1e-6 * _G_MPS2,
+        gyroscope_random_walk=gyro_walk,
+        accelerometer_random_walk=accel_walk,
+        gyroscope_bias_sigma=offset,
+        accelerometer_bias_sigma=accel_offset_mg * 1e-3 * _G_MPS2,
+    )
+
+
+_CLASSES = {
+    "consumer": _sensors(
+        gyro_noise_degps=0.014,
+        gyro_offset_degps=1.0,
+        gyro_walk=2e-5,
+        gyro_range_degps=2000.0,
+        gyro_scale=0.01,
+        gyro_late_s=5e-3,
+        accel_noise_ug=175.0,  # 160 along x and y, 190 along z
+        accel_offset_mg=20.0,
+        accel_walk=3e-3,
+    ),
+    "tactical": _sensors(
+        gyro_noise_degps=0.008,
+        gyro_offset_degps=0.2,
+        gyro_walk=4e-6,
+        gyro_range_degps=2000.0,
+        gyro_scale=0.003,
+        gyro_late_s=1e-3,
+        accel_noise_ug=100.0,
+        accel_offset_mg=10.0,
+        accel_walk=6e-4,
+    ),
 }
+GYROS = {name: gyro for name, (gyro, _) in _CLASSES.items()}
+PRESETS = {name: noise for name, (_, noise) in _CLASSES.items()}
 CONSUMER, TACTICAL = PRESETS["consumer"], PRESETS["tactical"]
 
 
@@ -283,7 +260,9 @@ def preintegrate(
     bridged_s = jnp.sum(jnp.where(readings.bridged, readings.dt_s, 0))
     per_bridged = noise.bridged_variances().astype(dtype) * bridged_s
 
-    def step(carry: _Sums, row: tuple[Array, Array, Array, Array]) -> tuple[_Sums, None]:
+    def step(
+        carry: tuple[Array, ...], row: tuple[Array, Array, Array, Array]
+    ) -> tuple[tuple[Array, ...], None]:
         wxyz, v, p, P, chain = carry
         gyro, accel, dt, bridged = row
         dR = jaxlie.SO3(wxyz)

@@ -8,6 +8,7 @@ Source: Liu, Schofield, Shan (2023), Algorithm 1, "get both possible poses using
 and Eq. 3".
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,8 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.linalg.small_matrices import in_order, where
 from jaxnav.core.models.camera import Camera
@@ -30,54 +30,11 @@ from jaxnav.core.models.geometry import (
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.pose.ippe import ippe_from_rays
 from jaxnav.core.pose.observation import Sightings, Snapshot, cameras_of
-from jaxnav.core.pose.refine import refine_sightings
+from jaxnav.core.pose.refine import Candidates, refine_sightings
 from jaxnav.core.pose.residuals import reprojection_residuals
 
 # Two local minima this close are merged: 1.1 degrees, and 0.02 of the distance to the marker.
 SAME_POSE_RAD = 0.02
-
-
-class Candidates(eqx.Module):
-    """N poses of the vehicle, sorted by e1. Lanes that are not `valid` hold finite numbers.
-
-    `cost` is what the refinement minimised, whitened by the corners' sigma; `e1_px2` is the
-    paper's.
-    """
-
-    T_vehicle_world: jaxlie.SE3  # batch axis (N,)
-    e1_px2: Float[Array, " N"]
-    cost: Float[Array, " N"]  # sum of (residual / sigma)^2
-    covariance: Float[Array, "N 6 6"]  # of xi in T_world_vehicle * exp(xi)
-    valid: Bool[Array, " N"]
-    converged: Bool[Array, " N"]
-    steps: Int[Array, " N"]
-
-    @staticmethod
-    def none(count: int, dtype: DTypeLike) -> "Candidates":
-        """`count` lanes, none of them valid."""
-        zeros = jnp.zeros(count, dtype)
-        return Candidates(
-            T_vehicle_world=jaxlie.SE3(jnp.zeros((count, 7), dtype).at[:, 0].set(1)),
-            e1_px2=zeros,
-            cost=zeros,
-            covariance=jnp.zeros((count, 6, 6), dtype),
-            valid=zeros > 0,
-            converged=zeros > 0,
-            steps=jnp.zeros(count, int),
-        )
-
-    @property
-    def least_cost(self) -> Float[Array, ""]:
-        """The cost of the best candidate; inf without one."""
-        return jnp.min(jnp.where(self.valid, self.cost, jnp.inf))
-
-    def padded(self, count: int) -> "Candidates":
-        """The candidates with lanes appended up to `count`, which are not valid."""
-        kept = self.valid.shape[0]
-        more = jax.tree.map(
-            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
-        )
-        return eqx.tree_at(lambda c: c.valid, more, more.valid & (jnp.arange(count) < kept))
 
 
 def find_candidates(
@@ -120,30 +77,25 @@ def find_candidates(
         Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
         owner_visible = owner_visible[best]
 
-    refined = refine_sightings(
+    found = refine_sightings(
         rig, markers, seen, Ts_vehicle_world, max_steps, ground_plane, wanted=owner_visible
     )
-    e1_px2 = refined.e1_px2
     # Corners far outside of any image can overflow; such a lane is no candidate.
-    finite = jnp.isfinite(e1_px2) & jnp.isfinite(refined.cost)
-    valid = owner_visible & finite
+    finite, valid = found.valid, owner_visible & found.valid
     # Of several sightings, what still falls after the last step is on its way from the minimum of
     # one to that of all. Of one it is near its own: two that are about to become one are flat.
     alone = jnp.sum(seen.visible) < 2
-    valid &= refined.converged | alone | ~jnp.any(valid & refined.converged)
-    e1_px2 = jnp.where(finite, e1_px2, 0)
-    refined = eqx.tree_at(lambda r: r.cost, refined, jnp.where(finite, refined.cost, 0))
-    order = in_order(-jnp.where(valid, e1_px2, jnp.inf), count)
-    refined, e1_px2, valid = jax.tree.map(lambda leaf: leaf[order], (refined, e1_px2, valid))
-    return Candidates(
-        T_vehicle_world=refined.T_vehicle_world,
-        e1_px2=e1_px2,
-        cost=refined.cost,
-        covariance=refined.covariance,
-        valid=valid & ~_repeats(refined.T_vehicle_world, seen, markers, valid),
-        converged=refined.converged,
-        steps=refined.steps,
+    valid &= found.converged | alone | ~jnp.any(valid & found.converged)
+    found = dataclasses.replace(
+        found,
+        e1_px2=jnp.where(finite, found.e1_px2, 0),
+        cost=jnp.where(finite, found.cost, 0),
+        valid=valid,
     )
+    order = in_order(-jnp.where(valid, found.e1_px2, jnp.inf), count)
+    found = jax.tree.map(lambda leaf: leaf[order], found)
+    repeats = _repeats(found.T_vehicle_world, seen, markers, found.valid)
+    return dataclasses.replace(found, valid=found.valid & ~repeats)
 
 
 def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:

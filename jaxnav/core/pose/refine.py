@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import optimistix as optx
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.core.linalg.levenberg_marquardt import (
@@ -53,21 +54,49 @@ _PRIOR_SIGMA = 1.0
 _AT_MINIMUM, _AT_MINIMUM_SHARE = 1e-2, 3e-6
 
 
-class RefinedPose(eqx.Module):
-    """A pose at a local minimum of e1, with its covariance from J'J there.
+class Candidates(eqx.Module):
+    """N poses of the vehicle at local minima of e1; `find_candidates` sorts them by it.
 
-    A lane whose numbers overflowed has an infinite cost, is not `converged`, and holds the start
-    and an identity covariance.
+    Lanes that are not `valid` hold finite numbers; of a lane whose numbers overflowed, as
+    `refine_pose` returns it, costs are infinite, and pose and covariance the start and identity.
     """
 
-    T_vehicle_world: jaxlie.SE3
-    cost: Float[Array, "*N"]  # sum of (residual / sigma)^2
+    T_vehicle_world: jaxlie.SE3  # batch axis (N,)
     # The paper's, Eq. 3: every sigma is 1 px. Of a rig with sigmas: in the cameras' most probable
     # errors, and what these cost.
     e1_px2: Float[Array, "*N"]
+    cost: Float[Array, "*N"]  # sum of (residual / sigma)^2, which the refinement minimises
     covariance: Float[Array, "*N 6 6"]  # of xi in T_world_vehicle * exp(xi): vehicle axes, (m, rad)
-    steps: Int[Array, "*N"]
+    valid: Bool[Array, "*N"]
     converged: Bool[Array, "*N"]  # it is within a tenth of a sigma of the minimum
+    steps: Int[Array, "*N"]
+
+    @staticmethod
+    def none(count: int, dtype: DTypeLike) -> "Candidates":
+        """`count` lanes, none of them valid."""
+        zeros = jnp.zeros(count, dtype)
+        return Candidates(
+            T_vehicle_world=jaxlie.SE3(jnp.zeros((count, 7), dtype).at[:, 0].set(1)),
+            e1_px2=zeros,
+            cost=zeros,
+            covariance=jnp.zeros((count, 6, 6), dtype),
+            valid=zeros > 0,
+            converged=zeros > 0,
+            steps=jnp.zeros(count, int),
+        )
+
+    @property
+    def least_cost(self) -> Float[Array, ""]:
+        """The cost of the best candidate; inf without one."""
+        return jnp.min(jnp.where(self.valid, self.cost, jnp.inf))
+
+    def padded(self, count: int) -> "Candidates":
+        """The candidates with lanes appended up to `count`, which are not valid."""
+        kept = self.valid.shape[0]
+        more = jax.tree.map(
+            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
+        )
+        return eqx.tree_at(lambda c: c.valid, more, more.valid & (jnp.arange(count) < kept))
 
 
 def refine_pose(
@@ -78,7 +107,7 @@ def refine_pose(
     T_vehicle_world: jaxlie.SE3,
     corner_sigma_px: Float[Array, "*sigma"] | float = 1.0,
     max_steps: int = 100,
-) -> RefinedPose:
+) -> Candidates:
     """The local minimum of e1 (Eq. 3) next to a pose, over all cameras, markers and corners.
 
     Corners are weighed by 1 / sigma^2. The covariance is (J'J)^-1 of the whitened residuals.
@@ -108,7 +137,7 @@ def refine_sightings(
     max_steps: int,
     ground_plane: bool = False,
     wanted: Bool[Array, " N"] | None = None,
-) -> RefinedPose:
+) -> Candidates:
     """`refine_pose` from N poses, on sightings that have been gathered already.
 
     All lanes take as many steps as the slowest; those that are not `wanted` take none.
@@ -156,13 +185,14 @@ def refine_sightings(
     finite = jnp.all(jnp.isfinite(jnp.concatenate(numbers, axis=1)), axis=1)
     kept = jnp.where(finite[:, None], T.wxyz_xyz, Ts_vehicle_world.wxyz_xyz)
     unknown = jnp.eye(6, dtype=covariance.dtype)[None]
-    return RefinedPose(
+    return Candidates(
         T_vehicle_world=jaxlie.SE3(kept),
-        cost=jnp.where(finite, cost, jnp.inf),
         e1_px2=jnp.where(finite, e1_px2, jnp.inf),
+        cost=jnp.where(finite, cost, jnp.inf),
         covariance=jnp.where(finite[:, None, None], covariance, unknown),
-        steps=solution.steps,
+        valid=finite & jnp.isfinite(e1_px2),
         converged=(to_gain < _AT_MINIMUM + _AT_MINIMUM_SHARE * cost) & any_visible & finite,
+        steps=solution.steps,
     )
 
 

@@ -237,7 +237,7 @@ class Nuisance(eqx.Module):
     log_share: Float[Array, " N"]  # -log |I + J_t' J_t| / 2, what the residuals leave of the prior
 
     @staticmethod
-    def of(slopes: Float[Array, "t m g N"]) -> "Nuisance":
+    def from_slopes(slopes: Float[Array, "t m g N"]) -> "Nuisance":
         """The nuisance of these slopes. Groups must not move the same residual."""
         t, _, groups, lanes = slopes.shape
         eye = jnp.eye(t, dtype=slopes.dtype)[:, :, None, None]
@@ -270,7 +270,7 @@ class CameraSlopes(eqx.Module):
 
     def nuisance(self) -> Nuisance:
         """Both, new in every frame, with a single lane for all poses."""
-        return Nuisance.of(jnp.concatenate([self.places, self.turns])[..., None])
+        return Nuisance.from_slopes(jnp.concatenate([self.places, self.turns])[..., None])
 
 
 def camera_errors(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Nuisance | None:

@@ -21,8 +21,9 @@ from jaxnav.core.filter.choose import OrientationGiven, Ungated, judge_branch, p
 from jaxnav.core.filter.selectors import SELECTORS, make_selector
 from jaxnav.core.models.geometry import inverse_cayley, rotation_error_rad, safe_sqrt
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.experiments.studies.config import Config
 from jaxnav.experiments.studies.lanes import in_precision, run_lanes
 from jaxnav.experiments.studies.parameters import (

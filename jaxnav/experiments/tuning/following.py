@@ -22,8 +22,9 @@ from jaxnav.core.filter.motion import Motion
 from jaxnav.core.linalg.levenberg_marquardt import KEEP_FOUND
 from jaxnav.core.linalg.small_matrices import as_class
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import Candidates, ConsistentSnapshot
+from jaxnav.core.pose.candidates import ConsistentSnapshot
 from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.experiments.tuning.branches import error_of, nees, position_states
 from jaxnav.experiments.tuning.recorded import FrameSequences
 

@@ -17,8 +17,8 @@ from jaxnav.core.filter.smooth import Trail, doubt
 from jaxnav.core.linalg.small_matrices import first_highest
 from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Observation
+from jaxnav.core.pose.refine import Candidates
 
 
 class Kept(eqx.Module):

@@ -18,8 +18,8 @@ from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis, SecondPoses, give_slots, second_poses
 from jaxnav.core.models.geometry import rotation_error_rad
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Observation
+from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.core.filter.test_hypotheses import EYE, PLANAR, derivative, matrix, view, whitened_pixels
 from tests.reference.rigid import cayley, inverse_cayley
@@ -149,7 +149,7 @@ given_slots = jax.jit(give_slots)
 def test_every_second_pose_gets_an_empty_slot_of_its_own(wanted, empty):
     xi = np.arange(1, 13, dtype=float).reshape(4, 3)
     branches = given_slots(SecondPoses(jnp.asarray(wanted), jnp.asarray(xi)), jnp.asarray(empty))
-    taken = np.asarray(branches.taken)
+    taken = np.asarray(branches.wanted)
     assert not np.any(taken & ~np.asarray(empty))
     expected = xi[np.asarray(wanted)][: np.sum(empty)]
     np.testing.assert_array_equal(np.asarray(branches.xi)[taken], expected)

@@ -15,12 +15,11 @@ from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.filter.choose import (
     LowestReprojection,
     Mahalanobis,
+    MeasuredPose,
     ObjectSpace,
     Oracle,
     OrientationGiven,
     PaperCost,
-    PoseMeasurement,
-    PosePosterior,
     RatioTest,
     Selection,
     Selector,
@@ -28,8 +27,9 @@ from jaxnav.core.filter.choose import (
 )
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Snapshot
+from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
 from tests.reference import paper
@@ -140,10 +140,10 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
     """Shapes, types, ranges and finite numbers, whatever was asked."""
     K, N = selector.hypotheses, candidates.valid.shape[0]
     measured = selection.measured
-    assert isinstance(measured, PoseMeasurement if K == 1 else PosePosterior)
+    assert (measured.innovation is None) == (K == 1)
     assert measured.T_world_vehicle.wxyz_xyz.shape == (K, 7)
     assert measured.covariance.shape == (K, 6, 6)
-    if isinstance(measured, PosePosterior):
+    if isinstance(measured, MeasuredPose):
         assert measured.innovation.shape == (K, 3)
     for mask in (measured.valid, selection.kept):
         assert mask.shape == (K,)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from jaxnav.core.filter.choose import PoseMeasurement, PosePosterior
-from jaxnav.core.filter.errors import EACH, ErrorsPosterior, common_turn, not_told
+from jaxnav.core.filter.choose import MeasuredPose
+from jaxnav.core.filter.errors import EACH, ErrorsPosterior, common_turn, schmidt_update_along
 from jaxnav.core.filter.fit import fit_poses
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
@@ -200,13 +200,13 @@ def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(hidden):
         given = np.block([[given, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
     T_prior = worlds.planar(0.3, -0.2, 0.7)
     xi = PLANAR @ jnp.asarray(y[:d])
-    corrected = PosePosterior(
+    corrected = MeasuredPose(
         T_prior @ cayley(xi),
         PLANAR @ jnp.asarray(C[:d, :d]) @ PLANAR.T,
-        jnp.zeros(d),
-        jnp.ones(()),
         jnp.zeros(()),
         jnp.asarray(True),
+        jnp.zeros(d),
+        jnp.ones(()),
         ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows))),
     )
     correction, after = follow(jnp.asarray(P), T_prior, corrected, PLANAR, n - e)
@@ -221,12 +221,12 @@ def test_what_is_considered_keeps_mean_and_covariance(navigator):
     before = bank_at(navigator, rng)
     x, P = before.mean[0], before.covariance[0]
     after = x + 0.1, P / 2
-    mean, covariance = motion.considered(jnp.asarray(False), (x, P), after)
+    mean, covariance = motion.schmidt_update(jnp.asarray(False), (x, P), after)
     np.testing.assert_array_equal(mean[SIX:], x[SIX:])
     np.testing.assert_array_equal(covariance[SIX:, SIX:], P[SIX:, SIX:])
     np.testing.assert_array_equal(mean[:SIX], after[0][:SIX])
     np.testing.assert_array_equal(covariance[:SIX], after[1][:SIX])
-    learnt = motion.considered(jnp.asarray(True), (x, P), after)
+    learnt = motion.schmidt_update(jnp.asarray(True), (x, P), after)
     for one, other in zip(learnt, after, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -243,18 +243,18 @@ def test_a_pose_that_is_inflated_keeps_errors_that_are_considered_in_proportion(
     alike = rng.normal(size=(n, d))
     P = 0.01**2 * (alike @ alike.T + 0.05 * np.eye(n))
     freedom, C = PLANAR, P[:d, :d] / 2
-    corrected = PosePosterior(
+    corrected = MeasuredPose(
         worlds.planar(0.3, -0.2, 0.7),
         freedom @ jnp.asarray(inflation * C) @ freedom.T,
-        jnp.zeros(d),
-        jnp.asarray(inflation),
         jnp.zeros(()),
         jnp.asarray(True),
+        jnp.zeros(d),
+        jnp.asarray(inflation),
     )
     _, after = follow(jnp.asarray(P), worlds.planar(0.3, -0.2, 0.7), corrected, freedom, states)
     np.testing.assert_allclose(after[:d, :d], inflation * C, rtol=1e-7, atol=1e-12)
     posterior = jnp.zeros_like(x), after
-    _, considered = motion.considered(jnp.asarray(False), (x, jnp.asarray(P)), posterior)
+    _, considered = motion.schmidt_update(jnp.asarray(False), (x, jnp.asarray(P)), posterior)
     sigma = np.sqrt(np.diagonal(considered))
     assert np.linalg.eigvalsh(considered / np.outer(sigma, sigma)).min() > -1e-9
     np.testing.assert_array_equal(considered[states:, states:], P[states:, states:])
@@ -328,10 +328,10 @@ def test_the_pose_follows_where_wheels_spin(slip_sigma):
             obs, speed_mps=read, steering_rad=jnp.zeros(()), dt_s=jnp.asarray(1 / 15)
         )
         bank = motion.predict(bank, told)
-        there = PoseMeasurement(
+        there = MeasuredPose(
             worlds.planar(0.3 * time_s, 0.0, 0.0), R, jnp.zeros(()), jnp.asarray(True)
         )
-        offer = motion.measure(jax.tree.map(lambda leaf: leaf[0], bank), there, told)
+        offer = motion.offer(jax.tree.map(lambda leaf: leaf[0], bank), there)
         bank = eqx.tree_at(
             lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
         )
@@ -428,8 +428,8 @@ def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
             return motion.predict(bank, event), None
 
         bank, _ = jax.lax.scan(read, bank, steering)
-        there = PoseMeasurement(worlds.planar(*pose), R, jnp.zeros(()), jnp.asarray(True))
-        offer = motion.measure(jax.tree.map(lambda leaf: leaf[0], bank), there, obs)
+        there = MeasuredPose(worlds.planar(*pose), R, jnp.zeros(()), jnp.asarray(True))
+        offer = motion.offer(jax.tree.map(lambda leaf: leaf[0], bank), there)
         bank = eqx.tree_at(
             lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
         )
@@ -467,7 +467,7 @@ def test_a_body_that_moves_freely_learns_how_cameras_differ_and_not_how_they_tur
         covariance=jnp.asarray(spd(2 * EACH, rng, np.full(2 * EACH, 0.2))),
         rows=jnp.asarray(rows),
     )
-    measured = PosePosterior(
+    measured = MeasuredPose(
         T_world_vehicle=T @ cayley(jnp.asarray(0.01 * rng.normal(size=6))),
         covariance=jnp.asarray(spd(6, rng, np.full(6, 0.005))),
         log_likelihood=jnp.asarray(0.0),
@@ -509,7 +509,7 @@ def test_the_turn_of_cameras_alike_counts_in_radians_and_those_in_view(unseen):
         np.testing.assert_allclose(found[:, :, axis], expected, atol=1e-14)
     # Nothing in view: nothing is kept from being corrected.
     correction, P = jnp.arange(8.0), jnp.eye(8)
-    kept, wider = not_told(jnp.zeros((6, EACH)), 4 * P, correction, P)
+    kept, wider = schmidt_update_along(jnp.zeros((6, EACH)), 4 * P, correction, P)
     np.testing.assert_array_equal(kept, correction)
     np.testing.assert_array_equal(wider, P)
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxnav.core.filter.choose import judge_branch, position_error_m
 from jaxnav.core.models.geometry import rotation_error_rad
-from jaxnav.core.pose.candidates import Candidates
+from jaxnav.core.pose.refine import Candidates
 
 
 def turned(*degrees: float) -> jaxlie.SE3:

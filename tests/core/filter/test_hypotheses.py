@@ -13,7 +13,7 @@ import scipy.optimize
 import scipy.stats
 
 from jaxnav.core.filter.bank import Bank, PoseBelief, empty_bank, merge_heirs
-from jaxnav.core.filter.choose import PosePosterior, Selection
+from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.fit import fit_poses
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis, fan, nearer_to_another
@@ -21,8 +21,9 @@ from jaxnav.core.filter.motion import follow_pose
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import on_ground
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
 from tests.helpers.compiling import jit_to_run
@@ -456,7 +457,7 @@ def test_the_rest_of_the_state_follows_as_a_gaussian_does(n, freedom):
     T = T_prior @ jaxlie.SE3.exp(jnp.asarray(freedom @ expected[:d]))
     covariance = jnp.asarray(freedom @ P_expected[:d, :d] @ freedom.T)
     nis = jnp.zeros(d)
-    corrected = PosePosterior(T, covariance, nis, jnp.ones(()), jnp.zeros(()), jnp.asarray(True))
+    corrected = MeasuredPose(T, covariance, jnp.zeros(()), jnp.asarray(True), nis, jnp.ones(()))
     correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, jnp.asarray(freedom), n)
     np.testing.assert_allclose(correction, expected, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(after, P_expected, atol=1e-6 * np.max(P_expected))

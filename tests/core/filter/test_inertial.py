@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxnav.core.filter import odometry
-from jaxnav.core.filter.choose import PoseMeasurement, Selection
+from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.odometry import (
     SENSORS_END,
     SIX,
@@ -291,7 +291,7 @@ def test_poses_teach_the_bias_only_once_the_heading_is_known(apart_rad):
         prior = motion.predict(bank, obs)
         both = worlds.T_world_vehicle_from_planar(jnp.stack([seen, seen.at[2].add(apart_rad)]))
         covariance = jnp.tile(0.003**2 * jnp.eye(6), (2, 1, 1))
-        measured = PoseMeasurement(both, covariance, jnp.zeros(2), jnp.ones(2, bool))
+        measured = MeasuredPose(both, covariance, jnp.zeros(2), jnp.ones(2, bool))
         selection = Selection(
             measured=measured,
             kept=prior.initialised,

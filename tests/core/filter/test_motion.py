@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from jaxnav.core.filter.bank import Bank, Offer, apply_gate, restart_broken
-from jaxnav.core.filter.choose import PoseMeasurement, Selection
+from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.motion import Motion
 from jaxnav.core.filter.planar import BicycleKalman
@@ -27,10 +27,10 @@ def chosen(prior: Bank, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selec
     """What a selector says that gives one pose to every hypothesis, or none."""
     count = prior.log_weight.shape[0]
     return Selection(
-        measured=PoseMeasurement(
+        measured=MeasuredPose(
             T_world_vehicle=jaxlie.SE3(jnp.tile(T_world_vehicle.wxyz_xyz, (count, 1))),
             covariance=jnp.tile(jnp.asarray(covariance, float), (count, 1, 1)),
-            log_misfit=jnp.zeros(count),
+            log_likelihood=jnp.zeros(count),
             valid=jnp.full(count, taken),
         ),
         kept=prior.initialised,
@@ -445,7 +445,7 @@ def test_hypotheses_are_filters_of_their_own(kind):
             Ts = worlds.T_world_vehicle_from_planar(poses + offset)
             selection = dataclasses.replace(
                 chosen(prior, worlds.planar(0.0, 0.0, 0.0), R, True),
-                measured=PoseMeasurement(
+                measured=MeasuredPose(
                     Ts,
                     jnp.tile(R, (len(poses), 1, 1)),
                     jnp.zeros(len(poses)),

@@ -10,7 +10,7 @@ import pytest
 
 from jaxnav.core.filter import kalman
 from jaxnav.core.filter.bank import merge_heirs
-from jaxnav.core.filter.choose import PoseMeasurement
+from jaxnav.core.filter.choose import MeasuredPose
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.smooth import smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
@@ -216,13 +216,13 @@ def test_a_bank_keeps_what_it_has_learnt_where_it_merges_and_begins_anew_at_the_
         atol=1e-12,
     )
     before, after = (bank.mean[0], bank.covariance[0]), (bank.mean[1], 0.5 * bank.covariance[1])
-    kept, P = MOTION.considered(jnp.asarray(False), before, after)
+    kept, P = MOTION.schmidt_update(jnp.asarray(False), before, after)
     np.testing.assert_array_equal(kept[13:], errors[0])
     np.testing.assert_array_equal(P[12:, 12:], bank.covariance[0, 12:, 12:])
-    np.testing.assert_array_equal(MOTION.considered(jnp.asarray(True), before, after)[0], after[0])
-    seen = PoseMeasurement(
-        jaxlie.SE3.identity(), 1e-4 * jnp.eye(6), jnp.zeros(()), jnp.asarray(True)
+    np.testing.assert_array_equal(
+        MOTION.schmidt_update(jnp.asarray(True), before, after)[0], after[0]
     )
+    seen = MeasuredPose(jaxlie.SE3.identity(), 1e-4 * jnp.eye(6), jnp.zeros(()), jnp.asarray(True))
     mean, P = MOTION.start(jax.tree.map(lambda leaf: leaf[0], bank), seen, reading(jnp.zeros(6)))
     np.testing.assert_array_equal(mean[13:], 0)
     np.testing.assert_array_equal(P[6:, 6:], P_rest)

@@ -12,8 +12,8 @@ import pytest
 from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.filter.errors import RepeatedErrors, Repeats, surprise_of, unexplained
 from jaxnav.core.models.geometry import OFF_GROUND, ON_GROUND, cayley
-from jaxnav.core.pose.candidates import Candidates
 from jaxnav.core.pose.observation import Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.sim.corners import drifted, see
 from tests import worlds
 from tests.derivatives import in_float32

@@ -12,8 +12,9 @@ import scipy.optimize
 
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.pose.candidates import Candidates, find_candidates
+from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.refine import Candidates
 from jaxnav.core.pose.residuals import e1
 from tests import worlds
 from tests.derivatives import in_float32

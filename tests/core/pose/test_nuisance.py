@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import sightings
-from jaxnav.core.pose.refine import RefinedPose, refine_pose
+from jaxnav.core.pose.refine import Candidates, refine_pose
 from jaxnav.core.pose.residuals import Nuisance, camera_errors
 from tests import worlds
 from tests.derivatives import check_derivatives
@@ -55,7 +55,7 @@ def groups() -> tuple[Nuisance, np.ndarray]:
     slopes = rng.normal(size=(2, 10, 2, 3))
     slopes[:, 6:, 0] = 0
     slopes[:, :6, 1] = 0
-    return Nuisance.of(jnp.asarray(slopes)), slopes.transpose(3, 1, 0, 2).reshape(3, 10, 4)
+    return Nuisance.from_slopes(jnp.asarray(slopes)), slopes.transpose(3, 1, 0, 2).reshape(3, 10, 4)
 
 
 def test_what_is_left_is_the_dense_quadratic_form(groups):
@@ -193,7 +193,7 @@ def test_exact_cameras_have_no_nuisance():
 # --- poses found with them ------------------------------------------------------------
 
 
-def errors_of(T_world_vehicle: jaxlie.SE3, refined: RefinedPose) -> np.ndarray:
+def errors_of(T_world_vehicle: jaxlie.SE3, refined: Candidates) -> np.ndarray:
     """xi (6,) in T_world_vehicle * exp(xi) = estimate."""
     return np.asarray((T_world_vehicle.inverse() @ refined.T_vehicle_world.inverse()).log())
 

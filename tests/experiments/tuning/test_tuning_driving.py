@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.core.control import Command, ControlState, TwistCommand, follower_along
+from jaxnav.core.control import Command, ControlInput, ControlState, TwistCommand, follower_along
 from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.models.imu import Gyro
@@ -45,9 +45,8 @@ class Knows(Navigator):
     def step(self, state, obs):
         pose = planar_from_T_world_vehicle(obs.T_world_vehicle_true)
         yes = jnp.asarray(True)
-        control, command, done, _ = self.controller(
-            state.control, pose, yes, obs.steering_rad, obs.dt_s, yes, None, obs.speed_mps
-        )
+        given = ControlInput(pose, yes, obs.steering_rad, obs.dt_s, yes, None, obs.speed_mps)
+        control, command, done, _ = self.controller(state.control, given)
         return State(state.belief, control), SimpleNamespace(
             candidates=SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int)),
             pose=pose,
