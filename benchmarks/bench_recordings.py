@@ -26,7 +26,7 @@ import numpy as np  # noqa: E402
 
 from jaxnav.core.filter.free import ConstantVelocity  # noqa: E402
 from jaxnav.core.filter.selectors import make_selector  # noqa: E402
-from jaxnav.core.models.vehicle import sigma_as_told  # noqa: E402
+from jaxnav.core.models.vehicle import default_odometry_sigma  # noqa: E402
 from jaxnav.files.poses import matrix, pose_from_matrix  # noqa: E402
 from jaxnav.recordings.other.recordings import Recording, read_recording  # noqa: E402
 from jaxnav.recordings.other.replay import Replay, errors, replay  # noqa: E402
@@ -236,7 +236,7 @@ def main() -> None:
             track = recording.odometry.earlier_by(args.odometry_delay_s)
             if args.odometry_sigma is not None:
                 scale, turn_deg = args.odometry_sigma
-                sigma = sigma_as_told(scale, np.deg2rad(turn_deg))
+                sigma = default_odometry_sigma(scale, np.deg2rad(turn_deg))
                 track = dataclasses.replace(track, sigma=sigma)
             recording = dataclasses.replace(recording, odometry=track)
         if args.camera_sigma is not None:

@@ -249,10 +249,10 @@ class Controller(Follower):
         alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad - beta_rad)
         steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)
         goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
-        lead = jnp.maximum(self.vehicle.speed_time_constant_s / explore.settle_s - 1, 0)
+        overshoot = jnp.maximum(self.vehicle.speed_time_constant_s / explore.settle_s - 1, 0)
         short_mps = explore.speed_mps - given.speed_mps
         short_mps = jnp.where(jnp.isfinite(short_mps), short_mps, 0)
-        throttle = (explore.speed_mps + lead * short_mps) / self.vehicle.speed_per_throttle_mps
+        throttle = (explore.speed_mps + overshoot * short_mps) / self.vehicle.speed_per_throttle_mps
         throttle = jnp.clip(throttle, 0, self.vehicle.throttle_limit)
         command = Command(steering, jnp.where(goes, throttle, 0))
         return state.exploring(given, side), command

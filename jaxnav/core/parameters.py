@@ -130,7 +130,7 @@ TUNABLES: dict[str, Tunable] = {
     "corner_sigma_px": Tunable("R: corners that come without a sigma of their own", "px", 1.0),
     "model_sigma_px": Tunable("R: added to the sigma that corners come with", "px", 0.15),
     "repeated_errors.least_share": Tunable(
-        "R: share of the corners' variance that repeats, before any corner has told",
+        "R: share of the corners' variance that repeats, before any corner has shown it",
         "1",
         0.05,
         most=(0.9,),

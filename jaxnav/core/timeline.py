@@ -4,10 +4,11 @@ Cameras and odometer have rates of their own, and a frame is as old as its detec
 caller keeps the last events, and the beliefs after some of them (see `loop.history`). A late event
 is fused from the belief before it, and the events after it are fused once more, in one call:
 
-    belief, then, control, output = advance(navigator, belief, control, events, count, new, ...)
+    belief, after_new, control, output = advance(navigator, belief, control, events, count, ...)
 
 Events in order, the usual case, take one turn of the loop. Where a camera's period is shorter than
-its delay every frame is late: the belief right after a frame, `then`, is where the next one starts.
+its delay every frame is late: the belief right after a frame, `after_new`, is where the next one
+starts.
 
 Source: Larsen, Andersen, Ravn, Poulsen (1998), "Incorporation of time delayed measurements in a
 discrete-time Kalman filter", section 2 (the filter recalculated through the delay).
@@ -118,17 +119,17 @@ def advance(
     def fuse(
         index: Array, carry: tuple[Belief, Belief, Evidence]
     ) -> tuple[Belief, Belief, Evidence]:
-        before, then, evidence = carry
+        before, after_new, evidence = carry
         previous_us = jnp.where(index > 0, events.stamps_us[jnp.maximum(index - 1, 0)], 0)
         dt_s = seconds(events.stamps_us[index] - previous_us)
         after, of_this = sense(before, events.at(index, dt_s, lanes).usable())
-        then, evidence = jax.tree.map(
-            lambda a, b: jnp.where(index == new, a, b), (after, of_this), (then, evidence)
+        after_new, evidence = jax.tree.map(
+            lambda a, b: jnp.where(index == new, a, b), (after, of_this), (after_new, evidence)
         )
-        return after, then, evidence
+        return after, after_new, evidence
 
     start = belief, belief, navigator.no_evidence(belief)
-    belief, then, evidence = jax.lax.fori_loop(0, count, fuse, start)
+    belief, after_new, evidence = jax.lax.fori_loop(0, count, fuse, start)
 
     last_us = jnp.where(count > 0, events.stamps_us[jnp.maximum(count - 1, 0)], 0)
     age_us = now_us - last_us
@@ -148,7 +149,7 @@ def advance(
     estimate = Estimate.from_belief(navigator.motion, present, evidence)
     last_heard = dataclasses.replace(obs, has_odometry=jnp.asarray(True))
     control, output = navigator.act(control, estimate, last_heard)
-    return belief, then, control, output
+    return belief, after_new, control, output
 
 
 def _twist(planar: Float[Array, " 3"]) -> Float[Array, " 6"]:

@@ -50,7 +50,7 @@ _SILENT_S = 0.1  # a longer gap between readings leaves the way unknown
 _SIGMAS = 3.0
 
 # Ranges change by this share more or less than the way: the prior of the wheels' scale, 3 %, and a
-# slip of 5 % that forgets itself on 0.2 m, over half a metre (`SENSORS_AS_TOLD`, `slip_sigma`).
+# slip of 5 % that forgets itself on 0.2 m, over half a metre (see `DEFAULT_SENSOR_SIGMA`).
 _WHEELS = 0.053
 # The noise counts this many times: of many looks in a row one is further off than three sigmas.
 # Fitted with what is beside it to 261 sound drives with wheels that are 10 % off, spin for 1 s of

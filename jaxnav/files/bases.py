@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.core.models.imu import GYROS, Gyro
-from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TWIST_ERRORS, TwistBase
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TWIST_ERRORS, TwistBase
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.files.ranges import within
 from jaxnav.files.validation import Entry, NonNegative, Number, Positive
@@ -82,7 +82,7 @@ class BaseFile(Entry):
 
     def vehicle(self) -> TwistBase:
         """The base, in the process's precision."""
-        told = zip(TWIST_ERRORS, TWIST_AS_TOLD, strict=True)
+        told = zip(TWIST_ERRORS, DEFAULT_TWIST_SIGMA, strict=True)
         sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
         return TwistBase.create(
             self.forward_limit_mps,

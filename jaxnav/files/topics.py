@@ -23,7 +23,11 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from jaxnav.core.models.conventions import FirstCorner
 from jaxnav.core.models.imu import PRESETS, ImuNoise
-from jaxnav.core.models.vehicle import SCALE_AS_TOLD, TURN_AS_TOLD_RAD, sigma_as_told
+from jaxnav.core.models.vehicle import (
+    DEFAULT_SCALE_SIGMA,
+    DEFAULT_TURN_SIGMA_RAD,
+    default_odometry_sigma,
+)
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
@@ -61,14 +65,14 @@ class OdometrySigma(Entry):
         turn_deg: of the direction of its body on the rig, about each axis.
     """
 
-    scale: Annotated[NonNegative, Field(le=_MOST_SCALE)] = SCALE_AS_TOLD
+    scale: Annotated[NonNegative, Field(le=_MOST_SCALE)] = DEFAULT_SCALE_SIGMA
     turn_deg: Annotated[NonNegative, Field(le=round(math.degrees(_MOST_TURN_RAD), 9))] = round(
-        math.degrees(TURN_AS_TOLD_RAD), 9
+        math.degrees(DEFAULT_TURN_SIGMA_RAD), 9
     )
 
     def sigma(self) -> Float[np.ndarray, " 4"]:
         """Of the scale, and of the direction, rad."""
-        return sigma_as_told(self.scale, math.radians(self.turn_deg))
+        return default_odometry_sigma(self.scale, math.radians(self.turn_deg))
 
 
 _Noise = Annotated[Positive, within("imu_noise")]

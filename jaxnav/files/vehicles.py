@@ -33,7 +33,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from jaxnav.core.models.origin import Origin, opposite, planar_in_world, points_in_world
-from jaxnav.core.models.vehicle import SENSOR_ERRORS, SENSORS_AS_TOLD, TwistBase, Vehicle
+from jaxnav.core.models.vehicle import DEFAULT_SENSOR_SIGMA, SENSOR_ERRORS, TwistBase, Vehicle
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files.bases import ACKERMANN, BaseFile, GyroEntry, base_data, gyro_data
@@ -89,7 +89,7 @@ class VehicleFile(Entry):
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
         figures = self.model_dump(exclude={*_NO_FIGURES}, exclude_none=True)
-        told = zip(SENSOR_ERRORS, SENSORS_AS_TOLD, strict=True)
+        told = zip(SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA, strict=True)
         sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
         gyro = None if self.gyro is None else self.gyro.gyro()
         return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None, gyro=gyro)
@@ -218,7 +218,7 @@ def vehicle_data(vehicle: Vehicle | TwistBase) -> dict[str, Any]:
     # Without corrections that correct nothing, any version of the program reads the file.
     written: dict[str, Any] = {n: value for n, value in data.items() if _FIGURES[n] != value}
     sigma = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma, float)
-    if not np.array_equal(sigma, SENSORS_AS_TOLD.astype(_dtype(vehicle))):
+    if not np.array_equal(sigma, DEFAULT_SENSOR_SIGMA.astype(_dtype(vehicle))):
         written["sigma"] = dict(zip(SENSOR_ERRORS, sigma.tolist(), strict=True))
     return written | gyro_data(vehicle.gyro)
 

@@ -3,7 +3,7 @@
 import equinox as eqx
 
 from jaxnav.core.models.imu import GYROS
-from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase, Vehicle
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase, Vehicle
 
 BASES = ("ackermann", "differential", "omni")
 IMUS = ("none", *GYROS)
@@ -20,7 +20,7 @@ def equipped(vehicle: Vehicle | TwistBase, base: str, imu: str) -> Vehicle | Twi
         left_limit_mps = 1.0 if base == "omni" else 0.0
         # It turns a little faster than once a second, as the scenario `gyro-late` asks.
         vehicle = TwistBase.create(
-            1.0, 7.0, 0.15, left_limit_mps, sensor_sigma=TWIST_AS_TOLD, gyro=vehicle.gyro
+            1.0, 7.0, 0.15, left_limit_mps, sensor_sigma=DEFAULT_TWIST_SIGMA, gyro=vehicle.gyro
         )
     if imu == "none":
         return vehicle

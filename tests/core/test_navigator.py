@@ -420,7 +420,7 @@ class EachItsOwn(eqx.Module):
             ),
             kept=prior.initialised,
             log_weight=log_weight,
-            heir=jnp.arange(2),
+            merged_into=jnp.arange(2),
             costs=jnp.where(candidates.valid, candidates.cost, jnp.inf),
             selected=jnp.where(jnp.any(valid), jnp.argmax(log_weight), -1),
             flip_probability=jnp.asarray(0.5),

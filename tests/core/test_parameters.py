@@ -11,7 +11,12 @@ from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.core.models.imu import GYROS
-from jaxnav.core.models.vehicle import OdometryErrors, TwistBase, sideslip_rad, sigma_as_told
+from jaxnav.core.models.vehicle import (
+    OdometryErrors,
+    TwistBase,
+    default_odometry_sigma,
+    sideslip_rad,
+)
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from tests import worlds
@@ -49,7 +54,9 @@ def test_a_name_is_the_path_of_its_number():
 def test_every_tunable_is_some_navigator_s():
     turns = TwistBase.create(1.0, 3.0, 0.1, gyro=GYROS["consumer"])
     base = Navigator(RIG, MARKERS, turns, worlds.WAYPOINTS_M)
-    led = ConstantVelocity(odometry_errors=OdometryErrors.create(sigma_as_told(), np.zeros(3)))
+    led = ConstantVelocity(
+        odometry_errors=OdometryErrors.create(default_odometry_sigma(), np.zeros(3))
+    )
     carried = Navigator(RIG, MARKERS, motion=led)
     navigators = DRIVER, HANDHELD, base, carried
     names = {name for navigator in navigators for name in parameters_of(navigator)}

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from jaxnav.core.models.imu import GYROS
-from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_car, load_vehicle, save_vehicle
 
@@ -32,7 +32,9 @@ def test_a_base_as_its_file_says(tmp_path):
     base = load_vehicle(written(tmp_path, DIFFERENTIAL | {"sigma": {"turn_gain": 0.1}}))
     assert isinstance(base, TwistBase)
     np.testing.assert_allclose(base.limits, [1.2, 0.0, 3.0])
-    np.testing.assert_allclose(base.sensor_sigma, [TWIST_AS_TOLD[0], 0.1, *TWIST_AS_TOLD[2:]])
+    np.testing.assert_allclose(
+        base.sensor_sigma, [DEFAULT_TWIST_SIGMA[0], 0.1, *DEFAULT_TWIST_SIGMA[2:]]
+    )
     assert base.gyro is None
     exact = dict.fromkeys(("speed_scale", "turn_gain", "turn_offset_radpm", "camera_delay_s"), 0.0)
     assert load_vehicle(written(tmp_path, OMNI | {"sigma": exact})).sensor_sigma is None

@@ -11,7 +11,7 @@ import pytest
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.vehicle import SENSORS_AS_TOLD, Vehicle
+from jaxnav.core.models.vehicle import DEFAULT_SENSOR_SIGMA, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.recordings.learnt import Learnt, as_filed, errors_of
 from tests import worlds
@@ -39,7 +39,7 @@ def turned(rig: CameraRig, camera: int, turn_rad: np.ndarray) -> CameraRig:
 
 def sensors_as_told() -> Vehicle:
     vehicle = worlds.qcar()
-    return dataclasses.replace(vehicle, sensor_sigma=jnp.asarray(SENSORS_AS_TOLD))
+    return dataclasses.replace(vehicle, sensor_sigma=jnp.asarray(DEFAULT_SENSOR_SIGMA))
 
 
 @pytest.fixture(scope="module")

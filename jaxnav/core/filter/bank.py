@@ -310,42 +310,42 @@ def excess_of(chi2: Float[Array, ""], freedom: Float[Array, ""]) -> Float[Array,
     return jnp.maximum(chi2 / (freedom + 3 * jnp.sqrt(2 * freedom)), 1)
 
 
-def merge_heirs(
+def merge_hypotheses(
     bank: Bank,
-    heir: Int[Array, " K"],
+    merged_into: Int[Array, " K"],
     difference: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, " d"]],
     moved: Callable[[Float[Array, " n"], Float[Array, " d"]], Float[Array, " n"]],
 ) -> Bank:
-    """The bank with hypotheses of one heir replaced by one Gaussian of the same two moments.
+    """The bank with those that merge replaced by one Gaussian of the same two moments.
 
     Args:
         bank: after the update, with the weights after it.
-        heir: index of the hypothesis into which each one is merged.
+        merged_into: index of the hypothesis into which each one is merged.
         difference: (mean, from) -> error state (d,).
         moved: (mean, error state) -> mean.
 
     Source: Salmond (2009), "Mixture reduction algorithms for point and extended object tracking".
     """
-    count = heir.shape[0]
+    count = merged_into.shape[0]
     if count == 1:
         return bank
     mass = jnp.where(bank.initialised, jnp.exp(bank.log_weight), 0)
-    member = (heir[None] == jnp.arange(count)[:, None]) & bank.initialised[None]
+    member = (merged_into[None] == jnp.arange(count)[:, None]) & bank.initialised[None]
     total = jnp.sum(jnp.where(member, mass[None], 0), axis=1)
     share = jnp.where(member, mass[None] / jnp.where(total > 0, total, 1)[:, None], 0)
     alone = jnp.sum(member, axis=1) <= 1
 
     def common() -> tuple[Array, Array]:
-        apart = jax.vmap(difference)(bank.mean, bank.mean[heir])
+        apart = jax.vmap(difference)(bank.mean, bank.mean[merged_into])
         shift = product(share, apart)
-        spread = apart - shift[heir]
+        spread = apart - shift[merged_into]
         second = bank.covariance + spread[:, :, None] * spread[:, None]
         covariance = product(share, second.reshape(count, -1)).reshape(second.shape)
         return jax.vmap(moved)(bank.mean, shift), covariance
 
     # Few frames merge anything.
     mean, covariance = jax.lax.cond(jnp.all(alone), lambda: (bank.mean, bank.covariance), common)
-    stays = bank.initialised & (heir == jnp.arange(count))
+    stays = bank.initialised & (merged_into == jnp.arange(count))
     return dataclasses.replace(
         bank,
         mean=jnp.where(alone[:, None], bank.mean, mean),
@@ -355,7 +355,7 @@ def merge_heirs(
     )
 
 
-def find_heirs(
+def find_merges(
     T_world_vehicle: jaxlie.SE3,
     covariance: Float[Array, "K 6 6"],
     log_weight: Float[Array, " K"],
@@ -383,7 +383,7 @@ def find_heirs(
     whitened = jax.vmap(lambda L, a: solve_lower(L, a.T))(factor, apart)
     close = jnp.sum(whitened**2, axis=1) < distance**2  # [receiver, other]
     close = close & alive[:, None] & alive[None]
-    # In steps: of two that weigh the same the first one is the heir, not the one of the last bit.
+    # In steps: of two that weigh the same the first one stays, not the one of the last bit.
     rank = ranks(jnp.floor(log_weight / EVEN_LOG_WEIGHT))
     heavier = rank[:, None] < rank[None]
     # A hypothesis that receives others is not merged itself.

@@ -63,7 +63,7 @@ class Selection(eqx.Module):
     measured: MeasuredPose
     kept: Bool[Array, " K"]  # False: this hypothesis is given up, or starts anew from `measured`
     log_weight: Float[Array, " K"]  # after this observation
-    heir: Int[Array, " K"]  # the hypothesis into which this one merges; its own index: none
+    merged_into: Int[Array, " K"]  # the hypothesis into which this one merges; its own index: none
     costs: Float[Array, " N"]  # of the candidates, in the selector's unit; inf where invalid
     selected: Int[Array, ""]  # candidate of the reported hypothesis, -1: none
     flip_probability: Float[Array, ""]  # probability that the reported pose is the wrong one
@@ -290,7 +290,7 @@ def _cheapest(
         ),
         kept=prior.initialised,
         log_weight=prior.log_weight,
-        heir=jnp.zeros(1, int),
+        merged_into=jnp.zeros(1, int),
         costs=costs,
         selected=jnp.where(any_valid, cheapest, -1),
         flip_probability=jnp.where(any_valid, doubts[cheapest], 0),

@@ -60,8 +60,8 @@ from jaxnav.core.pose.refine import Candidates
 from jaxnav.core.pose.residuals import (
     CameraSlopes,
     Nuisance,
-    answers,
     camera_slopes,
+    jacobian_by_twist,
     reprojection_rows,
 )
 
@@ -105,7 +105,7 @@ class ErrorsInView(eqx.Module):
     slopes: Float[Array, "t m"]  # of the residuals by q
 
     @staticmethod
-    def beside(
+    def at_predictions(
         pose_root: Float[Array, "K d d"],
         freedom: Float[Array, "6 d"],
         errors: CameraErrors,
@@ -222,13 +222,13 @@ class Nuisances(eqx.Module):
         moves = camera_slopes(snapshot.rig, snapshot.markers, snapshot.seen)
         places = cameras = in_view = vehicle = None
         if moves is not None and errors is not None:
-            in_view = ErrorsInView.beside(root, prior.freedom, errors, moves)
+            in_view = ErrorsInView.at_predictions(root, prior.freedom, errors, moves)
             places = Nuisance.from_slopes(moves.places[..., None])
             cameras = in_view.nuisance(places)
         elif moves is not None:
             cameras = moves.nuisance()
         _, slope = reprojection_rows(snapshot.rig, snapshot.seen)(corners)
-        by_pose = answers(slope, corners)
+        by_pose = jacobian_by_twist(slope, corners)
         tilts = -jnp.sum(by_pose[:, None] * prior.nuisance[:, :, None, None], axis=0)
         if places is not None:
             tilts = places.eliminated(tilts)
@@ -433,7 +433,7 @@ def surprise_of(
     corners = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     points = transform_points(T.inverse(), corners).T[..., None]
     residual, slope = reprojection_rows(snapshot.rig, snapshot.seen)(points)
-    r, J = residual.reshape(-1), product(spread.T, answers(slope, points)[..., 0])
+    r, J = residual.reshape(-1), product(spread.T, jacobian_by_twist(slope, points)[..., 0])
     information = gram(J) + jnp.eye(J.shape[0], dtype=J.dtype)
     explained = jnp.sum(solve_lower(cholesky(information), matvec(J, r)) ** 2)
     nis = jnp.sum(r**2) - explained - candidates.least_cost
@@ -460,7 +460,7 @@ def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array,
 
     stretched = jnp.asarray(np.kron([[1, -1, 1, -1]], np.eye(2)), slope.dtype)[:, None]
     units: list[Array] = []
-    for vector in [*by_sighting(answers(slope, about)), *jnp.tile(stretched, (count, 1))]:
+    for vector in [*by_sighting(jacobian_by_twist(slope, about)), *jnp.tile(stretched, (count, 1))]:
         for unit in units:
             vector = vector - unit * jnp.sum(unit * vector, axis=1, keepdims=True)
         length = safe_norm(vector)[:, None]

@@ -46,7 +46,13 @@ from jaxnav.core.models.geometry import (
     rotation_matrix,
 )
 from jaxnav.core.pose.observation import Snapshot, log_sigmas
-from jaxnav.core.pose.residuals import answers, cross_product, reprojection_rows, turn_arms, wrench
+from jaxnav.core.pose.residuals import (
+    cross_product,
+    jacobian_by_twist,
+    reprojection_rows,
+    turn_arms,
+    wrench,
+)
 
 
 class PoseFit(eqx.Module):
@@ -96,8 +102,8 @@ def fit_poses(
     root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
     spread = jax.vmap(lambda L: product(freedom, L))(root)
     corners = _corners(T_world_prior, snapshot)
-    beside = Nuisances.at_predictions(corners, root, errors, prior, snapshot)
-    linearised = _linearised(corners, jnp.moveaxis(spread, 0, -1), beside, snapshot)
+    nuisances = Nuisances.at_predictions(corners, root, errors, prior, snapshot)
+    linearised = _linearised(corners, jnp.moveaxis(spread, 0, -1), nuisances, snapshot)
 
     def with_prediction(u: Array, _: None) -> tuple[Any, NormalEquations]:
         r, normal = linearised(u)[:2]
@@ -132,9 +138,9 @@ def fit_poses(
         jnp.sum(r**2, axis=0),
         normal.gradient,
         normal.information,
-        beside.log_share,
+        nuisances.log_share,
         -jnp.broadcast_to(log_sigmas(snapshot.seen), usable.shape),
-        beside.errors_at_best(u, *raw),
+        nuisances.errors_at_best(u, *raw),
     )
     return fused
 
@@ -151,7 +157,7 @@ def _corners(T_world_prior: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "3 P
 def _linearised(
     corners: Float[Array, "3 P K"],
     spread: Float[Array, "6 d K"],
-    beside: Nuisances,
+    nuisances: Nuisances,
     snapshot: Snapshot,
 ) -> Callable[[Float[Array, "d K"]], tuple[Array, NormalEquations, tuple[Array, Array]]]:
     """The whitened residuals as a function of u, with the nuisances eliminated.
@@ -164,7 +170,7 @@ def _linearised(
         their normal equations, and to residuals and slopes (d, m, K) before the elimination.
     """
     rows = reprojection_rows(snapshot.rig, snapshot.seen)
-    errors = beside.with_pose()
+    errors = nuisances.with_pose()
 
     def linearised(u: Array) -> tuple[Array, NormalEquations, tuple[Array, Array]]:
         xi = jnp.sum(spread * u[None], axis=1)
@@ -177,7 +183,7 @@ def _linearised(
         along = along - cross_product(shift[:, None] / 2, turn)
         twist = jnp.concatenate([along, turn])
         residual, slope = rows(moved)
-        J = -jnp.sum(answers(slope, moved)[:, None] * twist[:, :, None], axis=0)
+        J = -jnp.sum(jacobian_by_twist(slope, moved)[:, None] * twist[:, :, None], axis=0)
         r = residual.reshape(J.shape[1:])
         if errors is not None:
             offset, with_pose = errors
@@ -186,7 +192,7 @@ def _linearised(
         raw = r, J
         # J and r each by itself: the gradient follows from r and the wrench alone, and so do its
         # derivatives.
-        r, J = beside.eliminated(r), beside.eliminated(J)
+        r, J = nuisances.eliminated(r), nuisances.eliminated(J)
         left = r[: residual[..., 0].size]
         w = jnp.concatenate(wrench((left.reshape(residual.shape), slope), moved))
         gradient = -jnp.sum(twist * w[:, None], axis=0)

@@ -271,18 +271,20 @@ class ConstantVelocity(FreeBody):
         """One hypothesis `obs.dt_s` later; see `predict`."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
-        told, twist = self._told(obs, dtype)
+        read, twist = self._twist_read(obs, dtype)
         if self.odometry_errors is not None:
             later, coasted = moved_by_twist(mean, P, mean[7:13], dt_s, True)
             coasts = later, coasted.at[:12, :12].add(Q)
-            return where(told, self._led(self.odometry_errors, mean, P, twist, dt_s), coasts)
-        u = jnp.where(told, twist, mean[7:13])
-        mean, P = moved_by_twist(mean, P, u, dt_s, ~told)
+            return where(
+                read, self._by_odometry(self.odometry_errors, mean, P, twist, dt_s), coasts
+            )
+        u = jnp.where(read, twist, mean[7:13])
+        mean, P = moved_by_twist(mean, P, u, dt_s, ~read)
         if obs.twist is not None:
-            P = P.at[6:12].multiply(1 - told).at[:, 6:12].multiply(1 - told)
-        return mean, P.at[:12, :12].add(jnp.where(told, self._drift(twist, dt_s), Q))
+            P = P.at[6:12].multiply(1 - read).at[:, 6:12].multiply(1 - read)
+        return mean, P.at[:12, :12].add(jnp.where(read, self._drift(twist, dt_s), Q))
 
-    def _told(
+    def _twist_read(
         self, obs: Observation, dtype: jnp.dtype
     ) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
         """Whether the odometry tells the motion, and its twist; 0 where it does not."""
@@ -292,7 +294,7 @@ class ConstantVelocity(FreeBody):
         usable = jnp.all(jnp.abs(twist) < _LARGEST_TWIST) & (jnp.asarray(obs.dt_s) > 0)
         return usable, jnp.where(usable, twist, 0)
 
-    def _led(
+    def _by_odometry(
         self, errors: OdometryErrors, mean: Array, P: Array, twist: Array, dt_s: Array
     ) -> Moments:
         """One hypothesis by odometry whose own errors are states."""
@@ -301,8 +303,8 @@ class ConstantVelocity(FreeBody):
         back = jaxlie.SE3.exp(u * dt_s).inverse()
 
         def off(change: Array) -> Array:
-            led = errors.corrected(twist, known + change)
-            return jnp.append(inverse_cayley(back @ jaxlie.SE3.exp(led * dt_s)), led)
+            corrected = errors.corrected(twist, known + change)
+            return jnp.append(inverse_cayley(back @ jaxlie.SE3.exp(corrected * dt_s)), corrected)
 
         F = jnp.zeros((12, _ERRORS.stop), dtype).at[:6, :6].set(back.adjoint())
         F = F.at[:, _ERRORS].set(jax.jacfwd(off)(jnp.zeros(ERRORS, dtype)))
@@ -311,7 +313,7 @@ class ConstantVelocity(FreeBody):
         return jnp.concatenate([T_world_vehicle.wxyz_xyz, u, mean[13:]]), P
 
     def _drift(self, twist: Array, dt_s: Array) -> Array:
-        """Q (12, 12) of an interval in which the odometry told the motion."""
+        """Q (12, 12) of an interval in which the odometry moved the body."""
         dtype = twist.dtype
         per_m, per_rad, walk_m, walk_rad = jnp.asarray(self.odometry_drift, dtype) ** 2
         speed, rate = safe_norm(twist[:3]), safe_norm(twist[3:])

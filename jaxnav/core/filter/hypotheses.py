@@ -27,7 +27,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxnav.core.filter.bank import EVEN_LOG_WEIGHT, PoseBelief, excess_of, find_heirs, normalise
+from jaxnav.core.filter.bank import EVEN_LOG_WEIGHT, PoseBelief, excess_of, find_merges, normalise
 from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.fit import PoseFit, fit_poses
 from jaxnav.core.linalg.levenberg_marquardt import mark_found
@@ -364,7 +364,7 @@ class MultiHypothesis(eqx.Module):
             snapshot: the observation with its rig and map.
 
         Returns:
-            A `MeasuredPose` for each hypothesis, with weights, heirs and `decided`.
+            A `MeasuredPose` for each hypothesis, with weights, merges and `decided`.
         """
         any_seen = jnp.any(snapshot.seen.visible)
         snapshot = self._trusted(snapshot, candidates)
@@ -438,11 +438,11 @@ class MultiHypothesis(eqx.Module):
         )
         flip_probability = jnp.sum(mass * wrong)
         located = jnp.any(alive)
-        heir = own
+        merged_into = own
         if count > 1:
-            heir = jax.lax.cond(
+            merged_into = jax.lax.cond(
                 jnp.sum(alive) > 1,
-                lambda: find_heirs(
+                lambda: find_merges(
                     T_after,
                     P_after,
                     jnp.where(alive, log_weight, -jnp.inf),
@@ -456,7 +456,7 @@ class MultiHypothesis(eqx.Module):
             measured=eqx.tree_at(lambda m: m.valid, posteriors, alive & any_seen),
             kept=alive & ~starts,
             log_weight=jnp.where(alive, log_weight, self.forget_log_weight),
-            heir=mark_found(heir),
+            merged_into=mark_found(merged_into),
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, nearest, -1),
             flip_probability=jnp.where(located, flip_probability, 0),

@@ -91,16 +91,16 @@ class InertialMotion(FreeBody):
         moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
         dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
         predicted = self.without_lost(bank, *moments, dt_s)
-        told, imu = self._told(obs, bank.mean.dtype)
-        return predicted if imu is None else self._rested(predicted, told & imu.still)
+        read, imu = self._imu_read(obs, bank.mean.dtype)
+        return predicted if imu is None else self._rested(predicted, read & imu.still)
 
     def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
         """One hypothesis `obs.dt_s` later, before rest tells it anything; see `predict`."""
-        told, imu = self._told(obs, mean.dtype)
+        read, imu = self._imu_read(obs, mean.dtype)
         coasted = self._coasted(mean, P, jnp.asarray(obs.dt_s, mean.dtype))
-        return coasted if imu is None else where(told, self._carried(mean, P, imu), coasted)
+        return coasted if imu is None else where(read, self._carried(mean, P, imu), coasted)
 
-    def _told(
+    def _imu_read(
         self, obs: Observation, dtype: jnp.dtype
     ) -> tuple[Bool[Array, ""], Preintegrated | None]:
         """Whether the IMU tells the motion, and what it tells."""

@@ -30,7 +30,7 @@ from jaxnav.core.filter.bank import (
     apply_gate,
     branched,
     contradicted,
-    merge_heirs,
+    merge_hypotheses,
     restart_broken,
 )
 from jaxnav.core.filter.choose import MeasuredPose, Selection
@@ -238,14 +238,14 @@ class Motion(eqx.Module):
         return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
 
     def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
-        """The posterior of every hypothesis (Eqs. 10 and 11), with those of one heir merged.
+        """The posterior of every hypothesis (Eqs. 10 and 11), with those merged that are one.
 
         A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
         NIS is inside the gate, and counted as a rejection where it is not.
 
         Args:
             bank: predicted.
-            selection: what each hypothesis takes as measured, its weight and its heir.
+            selection: what each hypothesis takes as measured, its weight, and into which it merges.
             obs: the observation; its odometry gives a hypothesis that starts its velocity.
         """
         if selection.parent is not None:
@@ -272,7 +272,7 @@ class Motion(eqx.Module):
             lambda: (bank.mean, bank.covariance),
         )
         updated: BankUpdate = jax.vmap(one)(bank, measured, first)
-        bank = merge_heirs(updated.bank, selection.heir, self.difference, self.moved)
+        bank = merge_hypotheses(updated.bank, selection.merged_into, self.difference, self.moved)
         return updated._replace(bank=bank)
 
     def error_covariance(self, bank: Bank, index: Int[Array, ""]) -> Float[Array, "d d"]:

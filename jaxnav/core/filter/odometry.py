@@ -38,7 +38,7 @@ scale and delay is not the same in every interval (a scale that depends on the r
 busy) is as large again, as noise: a random walk of the angle that is right at 1 rad, and a delay.
 
 The wheels read the velocity at the end of an interval, and a turn rate that slips with them; the
-gyro reads the whole turn. So where it has told, the wheels' turn rate moves nothing. The two are
+gyro reads the whole turn. So where it reads, the wheels' turn rate moves nothing. The two are
 compared twice, which teaches every hypothesis, since it holds whichever pose is the true one:
 while the wheels stand, z is the bias; while they turn, they show what they get wrong. Corners teach
 the bias as they do the errors of the other sensors, once the heading is known: a mirrored pose
@@ -107,8 +107,8 @@ def velocity_of_twist(twist: Float[Array, " 6"] | None, mean: Float[Array, " n"]
         mean: (6,), or longer with the errors p behind.
     """
     dtype, errors = mean.dtype, mean[SIX:SENSORS_END]
-    told = jnp.full(6, jnp.nan, dtype) if twist is None else jnp.asarray(twist, dtype)
-    read = jnp.stack([told[k] for k in _PLANAR])
+    given = jnp.full(6, jnp.nan, dtype) if twist is None else jnp.asarray(twist, dtype)
+    read = jnp.stack([given[k] for k in _PLANAR])
     usable = jnp.abs(read) < _LARGEST_TWIST
     moves = usable[0] & usable[1]
     present = jnp.stack([moves, moves, usable[2]])
@@ -184,8 +184,8 @@ def slipped(
     return mean.at[SLIP].multiply(kept), P.at[SLIP, SLIP].add((1 - kept**2) * sigma**2)
 
 
-def lead_after(
-    lead: Float[Array, " 3"], change: Float[Array, " 3"], dt_s: Float[Array, ""]
+def velocity_lead_after(
+    velocity_lead: Float[Array, " 3"], change: Float[Array, " 3"], dt_s: Float[Array, ""]
 ) -> Float[Array, " 3"]:
     """The lead of a velocity over its exponential mean, after an interval of constant acceleration.
 
@@ -194,42 +194,42 @@ def lead_after(
     Args:
         change: of the velocity in the interval.
     """
-    intervals = jnp.maximum(dt_s / MEMORY_S, jnp.finfo(lead.dtype).eps)
+    intervals = jnp.maximum(dt_s / MEMORY_S, jnp.finfo(velocity_lead.dtype).eps)
     faded = -jnp.expm1(-intervals)
-    return (1 - faded) * lead + faded / intervals * change
+    return (1 - faded) * velocity_lead + faded / intervals * change
 
 
 def seen_pose(
-    mean: Float[Array, " n"], lead: Float[Array, " 3"]
+    mean: Float[Array, " n"], velocity_lead: Float[Array, " 3"]
 ) -> tuple[Float[Array, " 3"], Float[Array, "3 h"]]:
     """Where the corners show the vehicle, and its derivative by the states before the cameras'.
 
     The derivative leaves out that the lead turns with the heading.
     """
-    slope = _sheared(mean, lead, -1)
-    return (mean[:3] if mean.shape[0] == SIX else mean[:3] - _way_since(mean, lead)), slope
+    slope = _sheared(mean, velocity_lead, -1)
+    return (mean[:3] if mean.shape[0] == SIX else mean[:3] - _way_since(mean, velocity_lead)), slope
 
 
 def from_seen(
-    mean: Float[Array, " n"], lead: Float[Array, " 3"]
+    mean: Float[Array, " n"], velocity_lead: Float[Array, " 3"]
 ) -> tuple[Float[Array, " n"], Float[Array, "3 h"]]:
     """The state of one whose first three entries are the seen pose, and their derivative by it.
 
     Of the derivative, the columns of the cameras' errors are left out: they are 0.
     """
     if mean.shape[0] == SIX:
-        return mean, _sheared(mean, lead, 1)
-    return mean.at[:3].add(_way_since(mean, lead)), _sheared(mean, lead, 1)
+        return mean, _sheared(mean, velocity_lead, 1)
+    return mean.at[:3].add(_way_since(mean, velocity_lead)), _sheared(mean, velocity_lead, 1)
 
 
-def _way_since(mean: Array, lead: Array) -> Array:
+def _way_since(mean: Array, velocity_lead: Array) -> Array:
     """tau (v - c l), by which the vehicle has moved since it was seen."""
     tau = mean[_DELAY]
     part = jnp.clip(tau / (2 * MEMORY_S), 0, 1)
-    return tau * (mean[3:SIX] - part * matvec(planar_rotation(mean[2]), lead))
+    return tau * (mean[3:SIX] - part * matvec(planar_rotation(mean[2]), velocity_lead))
 
 
-def _sheared(mean: Array, lead: Array, sign: int) -> Array:
+def _sheared(mean: Array, velocity_lead: Array, sign: int) -> Array:
     """Derivative of pose + sign tau (v - c l)."""
     slope = jnp.eye(3, min(mean.shape[0], SENSORS_END), dtype=mean.dtype)
     if mean.shape[0] == SIX:
@@ -237,7 +237,7 @@ def _sheared(mean: Array, lead: Array, sign: int) -> Array:
     tau = mean[_DELAY]
     # d (tau c) / d tau
     grown = jnp.where(tau < 2 * MEMORY_S, jnp.maximum(tau, 0) / MEMORY_S, 1)
-    by_delay = mean[3:SIX] - grown * matvec(planar_rotation(mean[2]), lead)
+    by_delay = mean[3:SIX] - grown * matvec(planar_rotation(mean[2]), velocity_lead)
     slope = slope.at[:, 3:SIX].set(sign * tau * jnp.eye(3, dtype=mean.dtype))
     return slope.at[:, _DELAY].set(sign * by_delay)
 
@@ -251,7 +251,7 @@ _GYRO_SCALE, _GYRO_DELAY, _GYRO_BIAS = -3, -2, -1
 
 
 def gyro_variance(gyro: Gyro, dtype: jnp.dtype) -> Float[Array, " 3"]:
-    """Variances of the errors of scale, delay (s^2) and bias, (rad/s)^2, that nothing has told."""
+    """Variances of the errors of scale, delay (s^2) and bias, (rad/s)^2, at first."""
     sigmas = gyro.scale_sigma, gyro.delay_sigma_s, gyro.bias_sigma_radps
     return jnp.stack([jnp.asarray(sigma, dtype) ** 2 for sigma in sigmas])
 
@@ -259,7 +259,7 @@ def gyro_variance(gyro: Gyro, dtype: jnp.dtype) -> Float[Array, " 3"]:
 class Turn(NamedTuple):
     """What a gyro says of an interval: the turn in it, and the turn rate at its end."""
 
-    told: Bool[Array, ""]
+    measured: Bool[Array, ""]
     turn_rad: Float[Array, ""]
     rate_radps: Float[Array, ""]
     changed_radps: Float[Array, ""]  # the rate, since the state before
@@ -281,11 +281,11 @@ def turn_of(
     """
     dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
     read = jnp.asarray(jnp.nan if obs.gyro_radps is None else obs.gyro_radps[2], dtype)
-    told = (jnp.abs(read) < gyro.saturation_radps) & (dt_s > 0)
-    dt_s = jnp.where(told, dt_s, 1)
+    measured = (jnp.abs(read) < gyro.saturation_radps) & (dt_s > 0)
+    dt_s = jnp.where(measured, dt_s, 1)
     white = jnp.asarray(gyro.noise_density, dtype) ** 2
     delay_s = jnp.asarray(gyro.delay_s, dtype) + mean[_GYRO_DELAY]
-    read = jnp.where(told, read, 0)
+    read = jnp.where(measured, read, 0)
     rate = (1 - mean[_GYRO_SCALE]) * read - mean[_GYRO_BIAS]
     changed = rate - mean[5]
     by_rate = jnp.stack([dt_s + delay_s, jnp.ones_like(dt_s)])  # of heading and rate
@@ -297,7 +297,7 @@ def turn_of(
     of_rate = white / dt_s + acceleration_density * dt_s / 3 + changed**2 / 4
     noise = jnp.stack([jnp.stack([of_angle, white]), jnp.stack([white, of_rate])])
     turn_rad = dt_s * rate + delay_s * changed
-    return Turn(told, turn_rad, rate, changed, slopes, noise.astype(dtype))
+    return Turn(measured, turn_rad, rate, changed, slopes, noise.astype(dtype))
 
 
 def turned(
@@ -338,9 +338,9 @@ def turned(
     psi_rad = mean[2] + turn.turn_rad
     parts = (mean[:2] + way_m, psi_rad[None], velocity, turn.rate_radps[None])
     return (
-        jnp.where(turn.told, jnp.concatenate(parts), later),
-        jnp.where(turn.told, rows, eye.at[:3, :SIX].set(A)),
-        jnp.where(turn.told, noise, Q),
+        jnp.where(turn.measured, jnp.concatenate(parts), later),
+        jnp.where(turn.measured, rows, eye.at[:3, :SIX].set(A)),
+        jnp.where(turn.measured, noise, Q),
     )
 
 
@@ -365,7 +365,7 @@ def slip_of(
         read: by the wheels, at the state after the turn.
         wheels_sigma_radps: noise of the wheels' turn rate.
     """
-    compared = turn.told & (read.present[2] > 0)
+    compared = turn.measured & (read.present[2] > 0)
     H = jnp.zeros_like(mean).at[5].set(1).at[SIX:SENSORS_END].set(-read.by_errors[2])
     change, by_slip = read.velocity[2] - mean[5], read.by_errors[2, 0]
     S = jnp.sum(H * matvec(P, H)) + wheels_sigma_radps**2
@@ -403,9 +403,9 @@ def bias_at_rest(
     slow = jnp.sum(before_mps**2) < _STANDS_MPS**2
     slow = slow & (jnp.sum(read.velocity[:2] ** 2) < _STANDS_MPS**2)
     slow = slow & (jnp.abs(read.velocity[2]) < _STANDS_RADPS) & jnp.all(read.present > 0)
-    white = jnp.asarray(gyro.noise_density, mean.dtype) ** 2 / jnp.where(turn.told, dt_s, 1)
+    white = jnp.asarray(gyro.noise_density, mean.dtype) ** 2 / jnp.where(turn.measured, dt_s, 1)
     steady = jnp.abs(turn.changed_radps) < _STEADY_RADPS + 4 * jnp.sqrt(white)
-    stands = (turn.told & slow & steady).astype(mean.dtype)
+    stands = (turn.measured & slow & steady).astype(mean.dtype)
     H = jnp.zeros((1, mean.shape[0]), mean.dtype).at[0, _GYRO_BIAS].set(1)
     R = (wheels_sigma_radps**2 + white)[None, None]
     seen = kalman.hide_rows((turn.rate_radps - read.velocity[2])[None], H, R, stands[None])

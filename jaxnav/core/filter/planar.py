@@ -33,13 +33,13 @@ from jaxnav.core.filter.odometry import (
     bias_at_rest,
     from_seen,
     gyro_variance,
-    lead_after,
     read_velocity,
     seen_pose,
     slip_of,
     slipped,
     turn_of,
     turned,
+    velocity_lead_after,
 )
 from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich
 from jaxnav.core.models.geometry import (
@@ -128,13 +128,13 @@ class BicycleKalman(Motion):
         """
         dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
 
-        def one(mean: Array, P: Array, lead: Array) -> tuple[Array, Array, Array]:
+        def one(mean: Array, P: Array, velocity_lead: Array) -> tuple[Array, Array, Array]:
             if self.vehicle.gyro is None:
                 later, P = self._read(*self.evolve(mean, P, obs), obs)
             else:
                 later, P = self._with_gyro(self.vehicle.gyro, mean, P, obs)
             change = _in_body(later) - _in_body(mean)
-            return later, P, lead_after(lead, change, dt_s)
+            return later, P, velocity_lead_after(velocity_lead, change, dt_s)
 
         predicted = eqx.tree_at(
             lambda b: (b.mean, b.covariance, b.velocity_lead),
@@ -150,7 +150,7 @@ class BicycleKalman(Motion):
             turn = self._turn(self.vehicle.gyro, obs, mean)
         later, P = self._later(mean, P, obs, turn)
         dt_s = jnp.asarray(obs.dt_s, mean.dtype)
-        return later, self._stepped(later, P, obs, dt_s, None if turn is None else turn.told)
+        return later, self._stepped(later, P, obs, dt_s, None if turn is None else turn.measured)
 
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses level on the ground (Eq. 12); height, roll and pitch are nuisances with a sigma."""
@@ -209,9 +209,9 @@ class BicycleKalman(Motion):
 
     def _adopted(self, bank: Bank, measured: MeasuredPose) -> Offer:
         """The same, of a pose that the selector has corrected by the corners."""
-        T, lead = measured.T_world_vehicle, bank.velocity_lead
+        T, velocity_lead = measured.T_world_vehicle, bank.velocity_lead
         pose = planar_from_T_world_vehicle(T)
-        seen, slope = seen_pose(bank.mean, lead)
+        seen, slope = seen_pose(bank.mean, velocity_lead)
         in_body = product(planar_rotation(-seen[2]), slope)
         predicted = kalman.replace_first(bank.covariance, in_body)
         freedom = jnp.asarray(ON_GROUND, pose.dtype)
@@ -224,7 +224,7 @@ class BicycleKalman(Motion):
             0 if self.vehicle.gyro is None else GYRO,
         )
         P = kalman.replace_first(P, planar_rotation(pose[2]))
-        posterior = _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, lead)
+        posterior = _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, velocity_lead)
         return Offer(
             measured.innovation,
             gate_nis=self.gate_nis,
@@ -314,7 +314,7 @@ class BicycleKalman(Motion):
         return jnp.asarray(0.0 if self.vehicle.sensor_sigma is None else self.slip_sigma, dtype)
 
     def _later(self, mean: Array, P: Array, obs: Observation, turn: Turn | None = None) -> Moments:
-        """The state `dt_s` later (Eq. 9), turned as a gyro has told."""
+        """The state `dt_s` later (Eq. 9), turned as a gyro has measured."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         A = jnp.eye(3, SIX, dtype=dtype).at[:, 3:].set(dt_s * jnp.eye(3, dtype=dtype))
         density = sandwich(planar_rotation(mean[2]), kalman.as_matrix(self.acceleration_density))
@@ -328,7 +328,9 @@ class BicycleKalman(Motion):
         way_m = safe_norm(mean[3:5]) * dt_s
         length_m = jnp.asarray(self.slip_length_m, dtype)
         if turn is not None:
-            length_m = jnp.where(turn.told, jnp.asarray(self.gyro_slip_length_m, dtype), length_m)
+            length_m = jnp.where(
+                turn.measured, jnp.asarray(self.gyro_slip_length_m, dtype), length_m
+            )
         if self.vehicle.gyro is not None:
             P = P.at[-1, -1].add(jnp.asarray(self.vehicle.gyro.bias_walk, dtype) ** 2 * dt_s)
         return slipped(later, P, way_m, self._slip_sigma(), length_m)
@@ -338,7 +340,7 @@ class BicycleKalman(Motion):
         return turn_of(gyro, obs, mean, density)
 
     def _with_gyro(self, gyro: Gyro, mean: Array, P: Array, obs: Observation) -> Moments:
-        """The state `dt_s` later, as a gyro and the odometry have told (`odometry.py`)."""
+        """The state `dt_s` later, by a gyro and the odometry (`odometry.py`)."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(dtype)
         turn, before_mps = self._turn(gyro, obs, mean), mean[3:5]
@@ -346,7 +348,7 @@ class BicycleKalman(Motion):
         if self.vehicle.sensor_sigma is not None:
             read = read_velocity(self.vehicle, obs, mean)
             mean, P = slip_of(turn, read, sigma_radps, mean, P)
-        mean, P = self._with_odometry(mean, P, obs, dt_s, turn.told)
+        mean, P = self._with_odometry(mean, P, obs, dt_s, turn.measured)
         read = read_velocity(self.vehicle, obs, mean)
         mean, P = bias_at_rest(gyro, turn, before_mps, read, sigma_radps, dt_s, mean, P)
         return mean.at[2].set(wrap_angle(mean[2])), P
@@ -365,7 +367,7 @@ class BicycleKalman(Motion):
 
         Args:
             since_s: time of the prediction, in which the velocity has changed.
-            turns: whether a gyro has told the turn, so that the wheels' is not looked at.
+            turns: whether a gyro has measured the turn, so that the wheels' is not looked at.
         """
         return self._read(mean, self._stepped(mean, P, obs, since_s, turns), obs, turns)
 
@@ -409,9 +411,9 @@ def planar_poses(
     return bank.mean[:, :3], bank.covariance[:, :3, :3]
 
 
-def _at_stamp(seen: Array, P: Array, lead: Array) -> Moments:
+def _at_stamp(seen: Array, P: Array, velocity_lead: Array) -> Moments:
     """A state at its stamp, of one whose first three entries are the seen pose."""
-    mean, slope = from_seen(seen, lead)
+    mean, slope = from_seen(seen, velocity_lead)
     return mean.at[2].set(wrap_angle(mean[2])), kalman.replace_first(P, slope)
 
 

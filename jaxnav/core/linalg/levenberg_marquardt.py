@@ -250,7 +250,7 @@ class ImplicitGradient(optx.AbstractAdjoint):
         root, residual = mark_found(
             optx.ImplicitAdjoint().apply(primal_fn, rewrite_fn, fixed, tags)
         )
-        return moving_with(root, inputs, gradient=_gradient, residual=residual), residual
+        return implicit_root(root, inputs, gradient=_gradient, residual=residual), residual
 
 
 def _gradient(y: Array, _: PyTree, inputs: PyTree) -> Array:
@@ -260,7 +260,7 @@ def _gradient(y: Array, _: PyTree, inputs: PyTree) -> Array:
 
 
 @eqx.filter_custom_jvp
-def moving_with(
+def implicit_root(
     root: Float[Array, "n N"],
     inputs: PyTree,
     *,
@@ -271,8 +271,8 @@ def moving_with(
     return root
 
 
-@moving_with.def_jvp
-def _moving_with_jvp(
+@implicit_root.def_jvp
+def _implicit_root_jvp(
     primals: PyTree, tangents: PyTree, *, gradient: Callable[..., Array], residual: PyTree
 ) -> tuple[Array, Array]:
     (root, inputs), (_, t_inputs) = primals, tangents

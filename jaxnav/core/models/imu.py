@@ -51,7 +51,7 @@ class Gyro(eqx.Module):
     """Errors of a gyroscope about one axis, for a filter and for a simulation."""
 
     noise_density: Float[Array, ""] | float  # N: rad/s/sqrt(Hz)
-    bias_sigma_radps: Float[Array, ""] | float  # of the bias before anything has told it
+    bias_sigma_radps: Float[Array, ""] | float  # of the bias before anything has measured it
     bias_walk: Float[Array, ""] | float  # K: random walk of the bias, rad/s/sqrt(s)
     saturation_radps: Float[Array, ""] | float  # a reading at the limit or beyond it is none
     scale_sigma: Float[Array, ""] | float = 0.0  # of the error e of its scale
@@ -66,7 +66,7 @@ class ImuNoise(eqx.Module):
     accelerometer_noise_density: float  # m/s^2/sqrt(Hz)
     gyroscope_random_walk: float  # of its bias, rad/s^2/sqrt(Hz)
     accelerometer_random_walk: float  # m/s^3/sqrt(Hz)
-    gyroscope_bias_sigma: float  # before anything tells it, rad/s
+    gyroscope_bias_sigma: float  # before anything measures it, rad/s
     accelerometer_bias_sigma: float  # m/s^2
     # How far off a reading may be that was held or interpolated for want of a better one.
     bridged_gyroscope_sigma: float = 2.0  # rad/s
@@ -213,8 +213,8 @@ class Preintegrated(eqx.Module):
 
     def usable(self, dtype: DTypeLike = float) -> "Preintegrated":
         """The same, or `none` where a number is not finite or the duration is not positive."""
-        told = [leaf for leaf in jax.tree.leaves(self) if leaf.dtype != bool]
-        good = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in told])))
+        numbers = [leaf for leaf in jax.tree.leaves(self) if leaf.dtype != bool]
+        good = jnp.all(jnp.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in numbers])))
         good = good & (self.duration_s > 0)
 
         def kept(leaf: Array, other: Array) -> Array:

@@ -20,7 +20,7 @@ from jaxnav.core.models.imu import Gyro
 
 # Errors of the sensors that a filter keeps, and their standard deviations where nobody says.
 SENSOR_ERRORS = ("speed_scale", "steering_gain", "steering_offset_rad", "camera_delay_s")
-SENSORS_AS_TOLD = np.asarray([0.03, 0.03, np.deg2rad(0.5), 0.02])
+DEFAULT_SENSOR_SIGMA = np.asarray([0.03, 0.03, np.deg2rad(0.5), 0.02])
 
 
 class Vehicle(eqx.Module):
@@ -32,8 +32,8 @@ class Vehicle(eqx.Module):
     throttle_limit: Float[Array, ""]  # in the driver's unit (QCar: PWM duty)
     speed_per_throttle_mps: Float[Array, ""]  # steady-state speed at throttle 1
     speed_time_constant_s: Float[Array, ""]  # first-order lag from throttle to speed
-    # Standard deviations of what is left of the errors below, as in `SENSORS_AS_TOLD`; None: the
-    # sensors are exact but for white noise.
+    # Standard deviations of what is left of the errors below, such as `DEFAULT_SENSOR_SIGMA`; None:
+    # the sensors are exact but for white noise.
     sensor_sigma: Float[Array, " 4"] | None = None
     gyro: Gyro | None = None
     # Calibration of its sensors. `jaxnav.drive.corrections` applies it; the core reads corrected
@@ -142,7 +142,7 @@ def advance_bicycle(
 # Errors of its odometry that a filter keeps, and their standard deviations where nobody says:
 # wheels that are a per cent apart turn a base of 0.3 m by 0.03 rad a metre.
 TWIST_ERRORS = ("speed_scale", "turn_gain", "turn_offset_radpm", "camera_delay_s")
-TWIST_AS_TOLD = np.asarray([0.03, 0.05, 0.03, 0.02])
+DEFAULT_TWIST_SIGMA = np.asarray([0.03, 0.05, 0.03, 0.02])
 
 
 class TwistBase(eqx.Module):
@@ -152,8 +152,8 @@ class TwistBase(eqx.Module):
     left_limit_mps: Float[Array, ""]  # |v_y|; 0: differential drive, tracks
     turn_limit_radps: Float[Array, ""]  # |omega|
     time_constant_s: Float[Array, ""]  # first-order lag from command to twist
-    # Standard deviations of the errors above, as in `TWIST_AS_TOLD`; None: the odometry is exact
-    # but for white noise.
+    # Standard deviations of the errors above, such as `DEFAULT_TWIST_SIGMA`; None: the odometry is
+    # exact but for white noise.
     sensor_sigma: Float[Array, " 4"] | None = None
     gyro: Gyro | None = None
 
@@ -202,14 +202,14 @@ def advance_twist(
 
 
 ERRORS = 4  # k, and m about the vehicle's x, y and z
-# Standard deviations of k and m where nobody says: the scale of other odometers (`TWIST_AS_TOLD`),
-# and a direction that was measured by hand or by a calibration of one degree.
-SCALE_AS_TOLD = 0.03
-TURN_AS_TOLD_RAD = float(np.deg2rad(1.0))
+# Standard deviations of k and m where nobody says: the scale of other odometers, as in
+# `DEFAULT_TWIST_SIGMA`, and a direction measured by hand or by a calibration of one degree.
+DEFAULT_SCALE_SIGMA = 0.03
+DEFAULT_TURN_SIGMA_RAD = float(np.deg2rad(1.0))
 
 
-def sigma_as_told(
-    scale: float = SCALE_AS_TOLD, turn_rad: float = TURN_AS_TOLD_RAD
+def default_odometry_sigma(
+    scale: float = DEFAULT_SCALE_SIGMA, turn_rad: float = DEFAULT_TURN_SIGMA_RAD
 ) -> Float[np.ndarray, " 4"]:
     """(k, m) of plain numbers."""
     return np.asarray([scale, turn_rad, turn_rad, turn_rad])

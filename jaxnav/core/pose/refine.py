@@ -25,7 +25,7 @@ from jaxnav.core.linalg.levenberg_marquardt import (
     LMState,
     NormalEquations,
     NormalEquationsLM,
-    moving_with,
+    implicit_root,
 )
 from jaxnav.core.linalg.small_matrices import cholesky, gram, product, solve_lower
 from jaxnav.core.models.geometry import ON_GROUND, rotation_matrix, safe_norm, skew
@@ -404,7 +404,7 @@ def _at_minima(
     T = jaxlie.SE3(jax.lax.stop_gradient(wxyz_xyz))
     marker = _SingleMarker(corners_n, size_m)
     here = jnp.zeros((6, 2), wxyz_xyz.dtype)
-    y = moving_with(here, (T, marker), gradient=_gradient_of_marker, residual=None)
+    y = implicit_root(here, (T, marker), gradient=_gradient_of_marker, residual=None)
     moved = marker.chart(T).transform(y)
     return moved.wxyz_xyz, marker.errors(moved)
 

@@ -207,7 +207,7 @@ def wrench(
     return jnp.sum(force, axis=1), jnp.sum(cross_product(points, force), axis=1)
 
 
-def answers(
+def jacobian_by_twist(
     slope: Float[Array, "3 2 P N"], points: Float[Array, "3 P N"]
 ) -> Float[Array, "6 2*P N"]:
     """Derivative of residuals by a shift and a turn of all points about the origin."""
@@ -307,7 +307,7 @@ def camera_slopes(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Camera
 
     points = _points_as_seen(rig, markers, seen)
     _, slope = reprojection_rows(rig, seen)(points)
-    moves = answers(slope, points)[..., 0]  # (6, 2 P)
+    moves = jacobian_by_twist(slope, points)[..., 0]  # (6, 2 P)
     in_sigmas = jnp.sum(moves[:, None, :, None] * spread.transpose(1, 2, 0)[:, :, None], axis=0)
     slopes = jnp.where(jnp.tile(member, (2, 1))[None], in_sigmas, 0)
     in_view = jnp.any(member & jnp.repeat(seen.visible, 4)[:, None], axis=0)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
-from jaxnav.core.models.vehicle import OdometryErrors, sigma_as_told
+from jaxnav.core.models.vehicle import OdometryErrors, default_odometry_sigma
 from jaxnav.files.poses import inverse, matrix
 from jaxnav.files.ranges import is_within
 
@@ -35,7 +35,7 @@ class OdometryTrack:
     stamps_ns: Int[np.ndarray, " N"]
     T_odom_sensor: Float[np.ndarray, "N 7"]
     T_vehicle_sensor: Float[np.ndarray, " 7"]
-    sigma: Float[np.ndarray, " 4"] = field(default_factory=sigma_as_told)
+    sigma: Float[np.ndarray, " 4"] = field(default_factory=default_odometry_sigma)
 
     def errors(self) -> OdometryErrors | None:
         """The errors that a filter keeps of it; None: it is exact but for its drift."""

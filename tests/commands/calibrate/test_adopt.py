@@ -10,7 +10,7 @@ import pytest
 
 from jaxnav.cli import main
 from jaxnav.core.filter.odometry import LEARNT, SENSORS_END, SIX, SLIP
-from jaxnav.core.models.vehicle import SENSORS_AS_TOLD
+from jaxnav.core.models.vehicle import DEFAULT_SENSOR_SIGMA
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
 from jaxnav.recordings.message_schemas import OUTCOME
 from jaxnav.recordings.outcomes import outcome_message
@@ -28,7 +28,7 @@ def setup_of(**changes):
     setup = make_setup()
     vehicle = dataclasses.replace(
         setup.vehicle,
-        sensor_sigma=jnp.asarray(SENSORS_AS_TOLD),
+        sensor_sigma=jnp.asarray(DEFAULT_SENSOR_SIGMA),
         speed_scale=1.1,
         steering_gain=0.9,
         steering_offset_rad=0.02,

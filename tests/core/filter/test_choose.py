@@ -148,7 +148,7 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
     for mask in (measured.valid, selection.kept):
         assert mask.shape == (K,)
         assert mask.dtype == bool
-    assert selection.log_weight.shape == selection.heir.shape == (K,)
+    assert selection.log_weight.shape == selection.merged_into.shape == (K,)
     assert selection.costs.shape == (N,)
     assert selection.selected.shape == selection.flip_probability.shape == ()
     assert selection.decided.shape == ()
@@ -160,7 +160,7 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
     assert all(np.all(np.isfinite(leaf)) for leaf in floats)
     np.testing.assert_array_equal(np.isfinite(selection.costs), candidates.valid)
     np.testing.assert_array_equal(np.isposinf(selection.costs), ~candidates.valid)
-    assert np.all((selection.heir >= 0) & (selection.heir < K))
+    assert np.all((selection.merged_into >= 0) & (selection.merged_into < K))
     assert -1 <= int(selection.selected) < N
     assert selection.selected == -1 or candidates.valid[selection.selected]
     assert 0 <= selection.flip_probability <= 1

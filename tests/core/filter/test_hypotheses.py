@@ -12,7 +12,7 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from jaxnav.core.filter.bank import Bank, PoseBelief, empty_bank, merge_heirs
+from jaxnav.core.filter.bank import Bank, PoseBelief, empty_bank, merge_hypotheses
 from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.fit import fit_poses
 from jaxnav.core.filter.free import ConstantVelocity
@@ -363,7 +363,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     covariances = roots @ np.swapaxes(roots, 1, 2)
     alive = np.array([True, True, True, True, False, True])
     weights = np.where(alive, rng.uniform(0.1, 1, count), 0.7)
-    heir = np.array([0, 0, 2, 0, 2, 2])
+    merged_into = np.array([0, 0, 2, 0, 2, 2])
     belief = Bank(
         jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
         empty_bank(jnp.zeros(n), jnp.eye(n), 3, count).rejections, jnp.arange(count),
@@ -374,10 +374,12 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
         apart = mean - base
         return apart.at[2].set(jnp.arctan2(jnp.sin(apart[2]), jnp.cos(apart[2])))
 
-    after = merge_heirs(belief, jnp.asarray(heir), difference, lambda mean, error: mean + error)
+    after = merge_hypotheses(
+        belief, jnp.asarray(merged_into), difference, lambda mean, error: mean + error
+    )
     assert after.initialised.tolist() == [True, False, True, False, False, False]
     for receiver in (0, 2):
-        who = np.flatnonzero((heir == receiver) & alive)
+        who = np.flatnonzero((merged_into == receiver) & alive)
         share = weights[who] / weights[who].sum()
         unrolled = means[who].copy()
         unrolled[:, 2] = np.mod(unrolled[:, 2], 2 * np.pi)
@@ -436,7 +438,7 @@ def test_nobody_merges_with_itself():
         jnp.asarray([True, False, True]), empty_bank(jnp.zeros(2), jnp.eye(2), 1, 3).rejections,
         jnp.arange(3), jnp.zeros((3, 1)), jnp.arange(3),
     )  # fmt: skip
-    after = merge_heirs(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
+    after = merge_hypotheses(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
     for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(motionless), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-15)
 

@@ -20,7 +20,7 @@ from jaxnav.core.filter.odometry import (
 )
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.imu import GYROS, Gyro
-from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase, velocity_world
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase, velocity_world
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives
@@ -119,8 +119,8 @@ def test_a_car_is_one_way_to_make_a_twist():
 @pytest.mark.parametrize("gyro_radps", [np.nan, 30.0, -np.inf])
 def test_a_gyro_that_is_silent_or_saturated_changes_nothing(gyro_radps):
     """Saturated at its limit, as a sensor reports it."""
-    with_gyro = BicycleKalman(base(GYRO, TWIST_AS_TOLD))
-    without = BicycleKalman(base(None, TWIST_AS_TOLD))
+    with_gyro = BicycleKalman(base(GYRO, DEFAULT_TWIST_SIGMA))
+    without = BicycleKalman(base(None, DEFAULT_TWIST_SIGMA))
     bank, expected = begun(with_gyro, [0.0, 0.0, 0.5]), begun(without, [0.0, 0.0, 0.5])
     for twist in ((0.3, 0.1, 1.0), (0.4, 0.0, -1.0), (0.0, 0.0, 0.0)):
         bank = predicted(with_gyro, bank, reading(twist, gyro_radps))
@@ -133,7 +133,9 @@ def test_a_gyro_that_is_silent_or_saturated_changes_nothing(gyro_radps):
 
 @pytest.mark.parametrize(("gyro_radps", "length_m"), [(np.nan, 0.1), (0.0, 0.4)])
 def test_a_slip_is_remembered_for_longer_while_a_gyro_tells(gyro_radps, length_m):
-    motion = BicycleKalman(base(GYRO, TWIST_AS_TOLD), slip_length_m=0.1, gyro_slip_length_m=0.4)
+    motion = BicycleKalman(
+        base(GYRO, DEFAULT_TWIST_SIGMA), slip_length_m=0.1, gyro_slip_length_m=0.4
+    )
     bank = begun(motion, [0.0, 0.0, 0.5])
     bank = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[:, SIX].set(0.3).at[:, 3].set(1.0))
     obs = dataclasses.replace(reading(gyro_radps=gyro_radps), has_odometry=jnp.asarray(False))
@@ -143,7 +145,7 @@ def test_a_slip_is_remembered_for_longer_while_a_gyro_tells(gyro_radps, length_m
 
 def test_the_heading_is_the_gyros_whatever_the_wheels_say():
     """With a bias that is constant, var psi = var psi_0 + N^2 t + sigma_b^2 t^2."""
-    motion = BicycleKalman(base(GYRO, TWIST_AS_TOLD))
+    motion = BicycleKalman(base(GYRO, DEFAULT_TWIST_SIGMA))
     bank, turned = begun(motion, [0.0, 0.0, 0.3]), 0.0
     for index in range(40):
         rate = np.sin(0.3 * index)
@@ -161,7 +163,7 @@ def test_errors_of_scale_and_delay_grow_with_the_turn_and_with_the_rate():
     """Three turns to one side and back leave none of the part that stays, but for d times a rate;
     the part that comes and goes is a walk of the angle, and a delay of each change."""
     off = dataclasses.replace(GYRO, scale_sigma=0.02, delay_sigma_s=0.01, bias_sigma_radps=0.0)
-    motion = BicycleKalman(base(off, TWIST_AS_TOLD))
+    motion = BicycleKalman(base(off, DEFAULT_TWIST_SIGMA))
     bank, sigmas = begun(motion, [0.0, 0.0, 0.0], sigma=1e-4), []
     for rate in np.repeat([4.0, -4.0, 0.0], 100):
         bank = predicted(motion, bank, reading((0.0, 0.0, rate), rate))
@@ -192,7 +194,7 @@ def test_a_turn_s_slopes_are_its_derivatives():
 def test_a_late_gyro_is_brought_forward():
     """At a rate that grows steadily the turn of the last interval is known but for its end."""
     late = dataclasses.replace(GYRO, delay_s=0.02)
-    motion = BicycleKalman(base(late, TWIST_AS_TOLD))
+    motion = BicycleKalman(base(late, DEFAULT_TWIST_SIGMA))
     bank, slope = begun(motion, [0.0, 0.0, 0.0]), 2.0
     psi = lambda t: slope * max(t, 0.0) ** 2 / 2  # noqa: E731
     for index in range(1, 21):
@@ -208,7 +210,7 @@ def test_a_late_gyro_is_brought_forward():
 
 def test_standing_teaches_the_bias_alone_and_every_hypothesis_alike():
     """The mean of n readings of variance R, beside a prior, whichever pose is true."""
-    motion = BicycleKalman(base(GYRO, TWIST_AS_TOLD))
+    motion = BicycleKalman(base(GYRO, DEFAULT_TWIST_SIGMA))
     bank = begun(motion, [0.0, 0.0, 0.3], [1.0, 0.5, -0.8])
     rng, bias, noise = np.random.default_rng(2), 0.03, NOISE / np.sqrt(DT_S)
     readings = bias + noise * rng.normal(size=30)
@@ -220,7 +222,7 @@ def test_standing_teaches_the_bias_alone_and_every_hypothesis_alike():
     np.testing.assert_allclose(bank.mean[:, -1], variance * used.sum() / R, rtol=1e-2)
     np.testing.assert_allclose(bank.covariance[:, -1, -1], variance, rtol=1e-2)
     np.testing.assert_array_equal(bank.mean[:, SIX:SENSORS_END], 0)
-    told = np.diag(np.append(0.05, TWIST_AS_TOLD) ** 2)
+    told = np.diag(np.append(0.05, DEFAULT_TWIST_SIGMA) ** 2)
     block = np.asarray(bank.covariance[:, SIX:SENSORS_END, SIX:SENSORS_END])
     np.testing.assert_allclose(block, [told, told], atol=1e-9)
     np.testing.assert_allclose(bank.mean[:, 2], [0.3, -0.8], atol=2e-3)
@@ -233,7 +235,7 @@ def test_a_gyro_teaches_wheels_their_errors_and_their_slip(rate_radps):
     rng = np.random.default_rng(4)
     n = SENSORS_END + odometry.GYRO
     of_gyro = [0.01, 0.005, BIAS_SIGMA]
-    scale = np.concatenate([np.full(SIX, 0.02), [0.05], TWIST_AS_TOLD, of_gyro])
+    scale = np.concatenate([np.full(SIX, 0.02), [0.05], DEFAULT_TWIST_SIGMA, of_gyro])
     A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
     P, mean = scale[:, None] * (A @ A.T) * scale, np.zeros(n)
     mean[5] = 0.8
@@ -269,7 +271,7 @@ def test_a_gyro_teaches_wheels_their_errors_and_their_slip(rate_radps):
     ],
 )
 def test_nothing_else_than_standing_teaches_the_bias(twists, readings):
-    motion = BicycleKalman(base(GYRO, TWIST_AS_TOLD))
+    motion = BicycleKalman(base(GYRO, DEFAULT_TWIST_SIGMA))
     bank = begun(motion, [0.0, 0.0, 0.3])
     # It has driven before, or a car that starts off would count as one that stands.
     bank = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[:, 3].set(np.nan_to_num(twists[0][0])))
@@ -282,7 +284,7 @@ def test_nothing_else_than_standing_teaches_the_bias(twists, readings):
 @pytest.mark.parametrize("apart_rad", [0.0, 1.0])
 def test_poses_teach_the_bias_only_once_the_heading_is_known(apart_rad):
     """Poses that turn by 0.05 rad/s less than a gyro of 0.05 rad/s says."""
-    motion = BicycleKalman(base(dataclasses.replace(GYRO), TWIST_AS_TOLD))
+    motion = BicycleKalman(base(dataclasses.replace(GYRO), DEFAULT_TWIST_SIGMA))
     bank = begun(motion, [0.0, 0.0, 0.3], [0.0, 0.0, 0.3 + apart_rad], sigma=0.01)
     seen = jnp.asarray([0.0, 0.0, 0.3])
 
@@ -296,7 +298,7 @@ def test_poses_teach_the_bias_only_once_the_heading_is_known(apart_rad):
             measured=measured,
             kept=prior.initialised,
             log_weight=prior.log_weight,
-            heir=jnp.arange(2),
+            merged_into=jnp.arange(2),
             costs=jnp.zeros(2),
             selected=jnp.asarray(0),
             flip_probability=jnp.asarray(0.5),
@@ -316,14 +318,14 @@ def test_poses_teach_the_bias_only_once_the_heading_is_known(apart_rad):
 
 
 def test_a_rule_that_takes_one_pose_has_the_papers_states():
-    motion = BicycleKalman(base(GYROS["consumer"], TWIST_AS_TOLD))
+    motion = BicycleKalman(base(GYROS["consumer"], DEFAULT_TWIST_SIGMA))
     assert motion.for_rig(worlds.qcar_rig_by_hand(), 1).init(1).mean.shape == (1, SIX)
     many = motion.for_rig(worlds.qcar_rig_by_hand(), 2).init(2)
     assert many.mean.shape == (2, SENSORS_END + 12 + odometry.GYRO)
 
 
 def test_gradients_are_finite_where_it_stands():
-    motion = BicycleKalman(base(GYROS["consumer"], TWIST_AS_TOLD))
+    motion = BicycleKalman(base(GYROS["consumer"], DEFAULT_TWIST_SIGMA))
     bank = begun(motion, [0.0, 0.0, 0.3])
 
     def heading(twist, z):

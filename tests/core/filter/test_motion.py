@@ -35,7 +35,7 @@ def chosen(prior: Bank, T_world_vehicle: jaxlie.SE3, covariance, taken) -> Selec
         ),
         kept=prior.initialised,
         log_weight=prior.log_weight,
-        heir=jnp.arange(count),
+        merged_into=jnp.arange(count),
         costs=jnp.zeros(2),
         selected=jnp.where(taken, 0, -1),
         flip_probability=jnp.asarray(0.0),

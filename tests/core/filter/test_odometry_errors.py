@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 from jaxnav.core.filter import kalman
-from jaxnav.core.filter.bank import merge_heirs
+from jaxnav.core.filter.bank import merge_hypotheses
 from jaxnav.core.filter.choose import MeasuredPose
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.smooth import smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
-from jaxnav.core.models.vehicle import OdometryErrors, sigma_as_told
+from jaxnav.core.models.vehicle import OdometryErrors, default_odometry_sigma
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives
 
 ARM_M = np.array([0.1, -0.05, 0.2])
-ERRORS = OdometryErrors.create(sigma_as_told(), ARM_M)
+ERRORS = OdometryErrors.create(default_odometry_sigma(), ARM_M)
 MOTION = ConstantVelocity(odometry_errors=ERRORS)
 DT_S = 0.2
 # 12 s, of which a marker shows the body in the first and the last two, and for 1 s in the middle.
@@ -206,7 +206,7 @@ def test_a_bank_keeps_what_it_has_learnt_where_it_merges_and_begins_anew_at_the_
         initialised=jnp.ones(2, bool),
         log_weight=jnp.log(jnp.asarray([0.75, 0.25])),
     )
-    merged = merge_heirs(bank, jnp.asarray([0, 0]), MOTION.difference, MOTION.moved)
+    merged = merge_hypotheses(bank, jnp.asarray([0, 0]), MOTION.difference, MOTION.moved)
     np.testing.assert_array_equal(merged.initialised, [True, False])
     np.testing.assert_allclose(merged.mean[0, 13:], 0.75 * errors[0] + 0.25 * errors[1], atol=1e-12)
     spread = (errors[0] - errors[1]) * np.sqrt(0.75 * 0.25)

@@ -16,7 +16,7 @@ from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import cayley, planar_from_T_world_vehicle
 from jaxnav.core.models.imu import Gyro
-from jaxnav.core.models.vehicle import TWIST_AS_TOLD, TwistBase, advance_bicycle
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase, advance_bicycle
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import parameters_of, with_parameters
 from jaxnav.core.pose.observation import Observation, Snapshot
@@ -271,7 +271,7 @@ def test_gradients_are_central_differences(loss):
 def test_a_gyro_s_numbers_are_learned_by_their_gradients():
     """Of a base that drives, slips and stands: against central differences of what is predicted."""
     gyro = Gyro(2e-3, 0.02, 0.02, 30.0, 0.02, delay_sigma_s=0.02)
-    base = TwistBase.create(1.0, 4.0, 0.15, sensor_sigma=TWIST_AS_TOLD, gyro=gyro)
+    base = TwistBase.create(1.0, 4.0, 0.15, sensor_sigma=DEFAULT_TWIST_SIGMA, gyro=gyro)
     navigator = Navigator(RIG, MARKERS, base)
     names = [name for name in parameters_of(navigator) if ".gyro." in name]
     assert len(names) == 5
