@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jaxnav.core.control import ControlInput, ControlLog, ControlState, Follower, follower_along
 from jaxnav.core.filter.bank import Bank, heaviest, renumber_if_empty
 from jaxnav.core.filter.choose import Selector, Ungated
-from jaxnav.core.filter.errors import RepeatedErrors, learn_repeats, weigh_repeats
+from jaxnav.core.filter.errors import RepeatedErrors, surprise_of
 from jaxnav.core.filter.estimate import Belief, Estimate, Evidence
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
@@ -180,27 +180,40 @@ class Navigator(eqx.Module):
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
         """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
-        return belief.with_prediction(self.motion.sound(self.motion.predict(belief.bank, obs)))
+        bank = self.motion.sound(self.motion.predict(belief.bank, obs))
+        given_up = jnp.any(belief.bank.initialised) & ~jnp.any(bank.initialised)
+        return replace(belief, bank=bank, restarts=belief.restarts + given_up)
 
     def correct(self, belief: Belief, seen: ConsistentSnapshot) -> tuple[Belief, Evidence]:
         """Select a pose for each predicted hypothesis (Eqs. 13-15), and update (Eqs. 10, 11)."""
         motion, snapshot = self.motion, seen.snapshot
         prior = renumber_if_empty(belief.bank)
         predicted = motion.poses(prior)
-        repeats = self.repeated_errors, belief.repeats
-        weighed = weigh_repeats(*repeats, predicted, heaviest(prior), seen.candidates, snapshot)
+        model, repeats, weighed = self.repeated_errors, belief.repeats, snapshot
+        if model is not None and repeats is not None:
+            surprise = surprise_of(predicted, heaviest(prior), seen.candidates, snapshot)
+            weighed = model.weighed(repeats, snapshot, surprise)
         selection = self.selector(predicted, seen.candidates, weighed)
         updated = motion.update(prior, selection, snapshot.obs)
-        updated = updated._replace(bank=motion.sound(updated.bank))
-        belief = belief.after(updated.bank, selection.decided, selection.flip_probability)
+        bank = motion.sound(updated.bank)
+        updated = updated._replace(bank=bank)
         evidence = Evidence.from_update(seen, prior, selection, updated, predicted.gate_nis)
-        best = motion.T_world_vehicle(belief.bank.mean[heaviest(belief.bank)])
-        known = belief.decided & evidence.agrees
-        return replace(belief, repeats=learn_repeats(*repeats, snapshot, best, known)), evidence
+        best = motion.T_world_vehicle(bank.mean[heaviest(bank)])
+        if model is not None and repeats is not None:
+            repeats = model.after(repeats, snapshot, best, selection.decided & evidence.agrees)
+        flip_probability = selection.flip_probability.astype(belief.flip_probability.dtype)
+        belief = Belief(bank, selection.decided, flip_probability, belief.restarts, repeats)
+        return belief, evidence
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
         """The predicted belief as the next one, where no marker is in view."""
-        return belief.coasted(), self.no_evidence(belief)
+        located = jnp.any(belief.bank.initialised)
+        coasted = replace(
+            belief,
+            decided=belief.decided & located,
+            flip_probability=jnp.where(located, belief.flip_probability, 0),
+        )
+        return coasted, self.no_evidence(belief)
 
     def act(
         self, control: ControlState | None, estimate: Estimate, obs: Observation

@@ -389,33 +389,6 @@ class RepeatedErrors(eqx.Module):
         return jnp.exp(-moved_px / self.renewal_px).astype(repeats.count.dtype)
 
 
-def weigh_repeats(
-    model: RepeatedErrors | None,
-    repeats: Repeats | None,
-    predicted: PoseBelief,
-    index: Int[Array, ""],
-    candidates: Candidates,
-    snapshot: Snapshot,
-) -> Snapshot:
-    """The snapshot weighed by the surprise of one prediction; as it is without a model."""
-    if model is None or repeats is None:
-        return snapshot
-    return model.weighed(repeats, snapshot, surprise_of(predicted, index, candidates, snapshot))
-
-
-def learn_repeats(
-    model: RepeatedErrors | None,
-    repeats: Repeats | None,
-    snapshot: Snapshot,
-    T_world_vehicle: jaxlie.SE3,
-    known: Bool[Array, ""],
-) -> Repeats | None:
-    """`model.after` a snapshot; None without a model."""
-    if model is None or repeats is None:
-        return None
-    return model.after(repeats, snapshot, T_world_vehicle, known)
-
-
 def surprise_of(
     predicted: PoseBelief, index: Int[Array, ""], candidates: Candidates, snapshot: Snapshot
 ) -> Float[Array, ""]:

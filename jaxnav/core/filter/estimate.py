@@ -1,6 +1,6 @@
 """`Belief`, the filter's state between observations, and `Estimate`, what is reported of it."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,24 +30,6 @@ class Belief(eqx.Module):
         """The belief before the first observation, with an empty bank."""
         nothing = jnp.zeros((), bank.mean.dtype)
         return Belief(bank, jnp.asarray(False), nothing, jnp.zeros((), jnp.int32), repeats)
-
-    def with_prediction(self, bank: Bank) -> "Belief":
-        """The belief with its bank predicted; a restart is counted where no hypothesis is left."""
-        given_up = jnp.any(self.bank.initialised) & ~jnp.any(bank.initialised)
-        return replace(self, bank=bank, restarts=self.restarts + given_up)
-
-    def coasted(self) -> "Belief":
-        """The belief after an observation without a marker in view, once it is predicted."""
-        located = jnp.any(self.bank.initialised)
-        flip_probability = jnp.where(located, self.flip_probability, 0)
-        return self.after(self.bank, self.decided & located, flip_probability)
-
-    def after(
-        self, bank: Bank, decided: Bool[Array, ""], flip_probability: Float[Array, ""]
-    ) -> "Belief":
-        """The belief after an observation, which keeps the number of restarts."""
-        flip_probability = flip_probability.astype(self.flip_probability.dtype)
-        return replace(self, bank=bank, decided=decided, flip_probability=flip_probability)
 
 
 class Evidence(eqx.Module):

@@ -18,6 +18,7 @@ Source: Liu, Schofield, Shan (2023), Eq. 13; MacKay (2003), chapter 27 (Laplace'
 Alspach, Sorenson (1972) (Gaussian sums).
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -367,7 +368,10 @@ class MultiHypothesis(eqx.Module):
             A `MeasuredPose` for each hypothesis, with weights, merges and `decided`.
         """
         any_seen = jnp.any(snapshot.seen.visible)
-        snapshot = self._trusted(snapshot, candidates)
+        # Corners that no pose explains by their sigma: the marker is blurred, bent or half hidden.
+        scale = jnp.minimum(jnp.sqrt(_misfit(candidates, snapshot)), self.max_misfit)
+        sigma_px = snapshot.seen.sigma_px * scale
+        snapshot = eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, sigma_px)
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
         count, bank = prior.log_weight.shape[0], prior
         if count == self.hypotheses:  # a bank is cut only where none of its hypotheses starts
@@ -384,23 +388,22 @@ class MultiHypothesis(eqx.Module):
         second = self.second_poses(bank, heaviest, candidates, snapshot)
         tried = give_slots(second, ~bank.initialised & ~starts)
         fits = fit_poses(
-            *predicted,
-            of_errors,
-            prior,
-            snapshot,
-            floor,
-            self.max_steps,
-            tried,
+            *predicted, of_errors, prior, snapshot, floor, self.max_steps, elsewhere=tried
         )
         alive = bank.initialised & fits.finite
-        inflation = self._inflation(fits, alive, starts, prior.freedom.shape[1])
-        free_cost = candidates.least_cost
-        posteriors = _contradicted(_inflated(fits.posterior, inflation), fits.cost - free_cost)
-        fits_one = starts | (jnp.min(jnp.where(alive, fits.cost, jnp.inf)) - free_cost < self.gate)
-        passes = starts | (_nis(posteriors) <= prior.gate_nis * inflation)
-        log_evidence = _log_evidence(fits, inflation)
-        evidence = self._bounded(log_evidence, alive & fits_one)
-        log_weight = jnp.where(alive, bank.log_weight + evidence, -jnp.inf)
+        posteriors, log_evidence, inflation = self._inflated(
+            fits, candidates.least_cost, alive, starts
+        )
+        least_cost = jnp.min(jnp.where(alive, fits.cost, jnp.inf))
+        fits_one = starts | (least_cost - candidates.least_cost < self.gate)
+        nis = jnp.sum(posteriors.innovation**2, axis=1)
+        passes = starts | (nis <= prior.gate_nis * inflation)
+        # What one frame subtracts from a log-weight is bounded.
+        compared = alive & fits_one
+        most = jnp.max(jnp.where(compared, log_evidence, -jnp.inf))
+        change = jnp.maximum(log_evidence - most, self.outlier_log_evidence)
+        change = jnp.where(compared, change, 0)
+        log_weight = jnp.where(alive, bank.log_weight + change, -jnp.inf)
 
         # A second posterior shares its parent's prediction, and is no surer of it than the parent.
         branches = tried.wanted & fits.finite & passes & fits_one & alive[does_as]
@@ -414,39 +417,19 @@ class MultiHypothesis(eqx.Module):
 
         # A hypothesis whose pose the gate rejects stays where it was predicted.
         corrected = posteriors.T_world_vehicle, posteriors.covariance
-        T_after, P_after = where(passes, corrected, predicted)
-        best = first_highest(log_weight, EVEN_LOG_WEIGHT)
-        T_best = jaxlie.SE3(T_after.wxyz_xyz[best])
-        apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(T_after)
-        sigmas_rad = safe_sqrt(jnp.trace(P_after[:, 3:, 3:], axis1=1, axis2=2))
-        mass = jnp.where(alive, jnp.exp(log_weight), 0)
-        far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
-        known_rad = safe_sqrt(jnp.sum(mass * (sigmas_rad**2 + apart_rad**2)))
-        to_best_rad = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_best))(
-            candidates.T_vehicle_world
+        after = where(passes, corrected, predicted)
+        costs, nearest, flip_probability, decided = self._verdict(
+            after, log_weight, alive, candidates, fits_one
         )
-        costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
-        nearest = first_highest(-costs, EVEN_RAD)
-        wrong = jnp.maximum(
-            beyond(self.far_rad, apart_rad, sigmas_rad),
-            # Candidates of a spoilt frame are of no branch.
-            jnp.where(
-                fits_one,
-                nearer_to_another(T_after, P_after, candidates, nearest),
-                0,
-            ),
-        )
-        flip_probability = jnp.sum(mass * wrong)
         located = jnp.any(alive)
         merged_into = own
         if count > 1:
             merged_into = jax.lax.cond(
                 jnp.sum(alive) > 1,
                 lambda: find_merges(
-                    T_after,
-                    P_after,
+                    *after,
                     jnp.where(alive, log_weight, -jnp.inf),
-                    self._linear(T_after, snapshot),
+                    self._linear(after[0], snapshot),
                     prior.freedom,
                     self.merge_distance,
                 ),
@@ -460,9 +443,80 @@ class MultiHypothesis(eqx.Module):
             costs=costs,
             selected=jnp.where(jnp.any(candidates.valid) & located, nearest, -1),
             flip_probability=jnp.where(located, flip_probability, 0),
-            decided=located & (far < self.decided_mass) & (known_rad < self.decided_sigma_rad),
+            decided=located & decided,
             parent=jnp.where(branches & alive, does_as, own),
         )
+
+    def _inflated(
+        self,
+        fits: PoseFit,
+        free_cost: Float[Array, ""],
+        alive: Bool[Array, " K"],
+        starts: Bool[Array, ""],
+    ) -> tuple[MeasuredPose, Float[Array, " K"], Float[Array, ""]]:
+        """The posteriors where all hypotheses misfit, their log-evidence, and the inflation.
+
+        The inflation, at least 1, by which the covariances of prediction and corners are too small
+        is the least NIS of the hypotheses over three sigmas of its chi-square. Where even that one
+        is contradicted, all hypotheses share one error: wheels slip, a stamp is late, a camera has
+        turned.
+
+        The NIS of a posterior is at least its excess cost over the best candidate, at `free_cost`.
+        Where residuals are linear it is that, plus what the prediction pays. In the wrong one of
+        two minima it is small as long as the prediction is wide, but the image contradicts it.
+        """
+        posterior = fits.posterior
+        nis = jnp.sum(posterior.innovation**2, axis=1)
+        least = jnp.min(jnp.where(alive, nis, jnp.inf))
+        known = jnp.isfinite(least) & ~starts
+        freedom = jnp.asarray(posterior.innovation.shape[1], least.dtype)
+        inflation = excess_of(jnp.where(known, least, 0), freedom)
+        inflation = jnp.minimum(inflation, self.max_inflation).astype(least.dtype)
+        excess = fits.cost - free_cost
+        more = (excess > nis) & (nis > 0)
+        growth = jnp.sqrt(jnp.where(more, excess / jnp.where(more, nis, 1), 1))
+        forgiven = jnp.where(fits.finite, nis, 0) * (1 - 1 / inflation) / 2
+        inflated = dataclasses.replace(
+            posterior,
+            covariance=posterior.covariance * inflation,
+            inflation=posterior.inflation * inflation,
+            innovation=posterior.innovation * growth[:, None],
+        )
+        return inflated, fits.log_evidence + forgiven, inflation
+
+    def _verdict(
+        self,
+        after: tuple[jaxlie.SE3, Float[Array, "K 6 6"]],
+        log_weight: Float[Array, " K"],
+        alive: Bool[Array, " K"],
+        candidates: Candidates,
+        fits_one: Bool[Array, ""],
+    ) -> tuple[Float[Array, " N"], Int[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+        """What is reported of the poses after the update, and their covariances.
+
+        Returns:
+            The candidates' angles from the reported pose, rad, the index of the nearest, the
+            probability that the reported pose is the wrong one, and whether the bank has decided.
+        """
+        T_world_vehicle, covariance = after
+        best = first_highest(log_weight, EVEN_LOG_WEIGHT)
+        T_best = jaxlie.SE3(T_world_vehicle.wxyz_xyz[best])
+        apart_rad = jax.vmap(lambda T: rotation_error_rad(T, T_best))(T_world_vehicle)
+        sigmas_rad = safe_sqrt(jnp.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
+        mass = jnp.where(alive, jnp.exp(log_weight), 0)
+        far = jnp.sum(jnp.where(apart_rad > self.far_rad, mass, 0))
+        known_rad = safe_sqrt(jnp.sum(mass * (sigmas_rad**2 + apart_rad**2)))
+        to_best_rad = jax.vmap(lambda T: rotation_error_rad(T.inverse(), T_best))(
+            candidates.T_vehicle_world
+        )
+        costs = jnp.where(candidates.valid, to_best_rad, jnp.inf)
+        nearest = first_highest(-costs, EVEN_RAD)
+        of_another = nearer_to_another(T_world_vehicle, covariance, candidates, nearest)
+        # Candidates of a spoilt frame are of no branch.
+        of_another = jnp.where(fits_one, of_another, 0)
+        wrong = jnp.maximum(beyond(self.far_rad, apart_rad, sigmas_rad), of_another)
+        decided = (far < self.decided_mass) & (known_rad < self.decided_sigma_rad)
+        return costs, nearest, jnp.sum(mass * wrong), decided
 
     def second_poses(
         self,
@@ -479,38 +533,6 @@ class MultiHypothesis(eqx.Module):
         settled = bank.log_weight[heaviest] > np.log(0.5) + EVEN_LOG_WEIGHT
         fits = _misfit(candidates, snapshot) < _TELLS_BRANCHES**2
         return second._replace(wanted=second.wanted & settled & fits)
-
-    def _trusted(self, snapshot: Snapshot, candidates: Candidates) -> Snapshot:
-        """The snapshot with the corners' sigma raised where no pose explains the corners.
-
-        Where the cost of the best candidate exceeds its chi-square by three sigmas, the sigma is
-        multiplied so that it does not: the marker is blurred, bent or half hidden.
-        """
-        scale = jnp.minimum(jnp.sqrt(_misfit(candidates, snapshot)), self.max_misfit)
-        sigma_px = snapshot.seen.sigma_px * scale
-        return eqx.tree_at(lambda s: s.seen.sigma_px, snapshot, sigma_px)
-
-    def _inflation(
-        self, fits: PoseFit, alive: Bool[Array, " K"], starts: Array, freedom: int
-    ) -> Float[Array, ""]:
-        """Factor, at least 1, by which the covariances of prediction and corners are too small.
-
-        It is the least NIS of the hypotheses over three sigmas of its chi-square. Where even that
-        one is contradicted, all hypotheses share one error: wheels slip, a stamp is late, a camera
-        has turned.
-        """
-        least = jnp.min(jnp.where(alive, _nis(fits.posterior), jnp.inf))
-        known = jnp.isfinite(least) & ~starts
-        excess = excess_of(jnp.where(known, least, 0), jnp.asarray(freedom, least.dtype))
-        return jnp.minimum(excess, self.max_inflation).astype(least.dtype)
-
-    def _bounded(
-        self, log_evidence: Float[Array, " K"], compared: Bool[Array, " K"]
-    ) -> Float[Array, " K"]:
-        """Bounded change of each log-weight by this frame; 0 for those that are not compared."""
-        best = jnp.max(jnp.where(compared, log_evidence, -jnp.inf))
-        bounded = jnp.maximum(log_evidence - best, self.outlier_log_evidence)
-        return jnp.where(compared, bounded, 0)
 
     def _linear(self, T: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "K 6"]:
         """Shifts and turns so small that the corners are linear in them, of poses (K,), m and rad.
@@ -538,36 +560,6 @@ def _started(
         lambda: changing(prior),
     )
     return eqx.tree_at(changing, prior, (wxyz_xyz, *rest), is_leaf=lambda leaf: leaf is None)
-
-
-def _log_evidence(fits: PoseFit, inflation: Float[Array, ""]) -> Float[Array, " K"]:
-    """Laplace's evidence, with the NIS by covariances as inflated."""
-    forgiven = jnp.where(fits.finite, _nis(fits.posterior), 0) * (1 - 1 / inflation) / 2
-    return fits.log_evidence + forgiven
-
-
-def _nis(posteriors: MeasuredPose) -> Float[Array, " K"]:
-    return jnp.sum(posteriors.innovation**2, axis=1)
-
-
-def _inflated(posteriors: MeasuredPose, inflation: Float[Array, ""]) -> MeasuredPose:
-    return eqx.tree_at(
-        lambda p: (p.covariance, p.inflation),
-        posteriors,
-        (posteriors.covariance * inflation, posteriors.inflation * inflation),
-    )
-
-
-def _contradicted(posteriors: MeasuredPose, excess: Float[Array, " K"]) -> MeasuredPose:
-    """The posteriors with a NIS of at least their excess cost over the best candidate.
-
-    Where residuals are linear the NIS is that excess, plus what the prediction pays. In the wrong
-    one of two minima it is small as long as the prediction is wide, but the image contradicts it.
-    """
-    nis = _nis(posteriors)
-    more = (excess > nis) & (nis > 0)
-    growth = jnp.sqrt(jnp.where(more, excess / jnp.where(more, nis, 1), 1))
-    return eqx.tree_at(lambda p: p.innovation, posteriors, posteriors.innovation * growth[:, None])
 
 
 def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
