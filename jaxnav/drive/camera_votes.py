@@ -5,7 +5,7 @@
         votes.count(data, due_px, stamp_ns)
     data = votes.remove_outvoted(data)
 
-A camera that was knocked is off by more than the filter learns of one (see `camera_errors`): its
+A camera that was knocked is off by more than the filter learns of one: its
 frames, and those that it shares with others, fit no pose, and the filter would give up the right
 one. A vehicle that was carried off is where no camera expects it. So an accusation counts only once
 another camera has seen markers where they should be, since.

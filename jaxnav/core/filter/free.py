@@ -24,8 +24,8 @@ from jaxnav.core.filter.bank import (
 )
 from jaxnav.core.filter.choose import MeasuredPose
 from jaxnav.core.filter.errors import EACH, common_turn, schmidt_update_along
-from jaxnav.core.filter.motion import Motion, camera_states, follow_pose
-from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, where
+from jaxnav.core.filter.motion import Motion, Planar, camera_states, follow_pose
+from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich, where
 from jaxnav.core.models.geometry import (
     cayley,
     inverse_cayley,
@@ -159,6 +159,13 @@ class FreeBody(Motion):
     def T_world_vehicle(self, mean: Float[Array, " n"]) -> jaxlie.SE3:
         """The pose of a mean."""
         return jaxlie.SE3(mean[:7])
+
+    def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "d d"]) -> Planar:
+        """See `Motion`: J P J' with the Jacobians of `on_ground`."""
+        P, still = covariance, jnp.zeros(covariance.shape[0], mean.dtype)
+        slopes = jax.jacfwd(lambda error: self.on_ground(self.moved(mean, error)))(still)
+        (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
+        return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
 
     def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
         """(x, y, psi) and (v_x, v_y, psi_dot) in the world: pose and motion seen from above."""

@@ -185,7 +185,7 @@ class InertialMotion(FreeBody):
         )
 
     def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-        """(x, y, psi) and (v_x, v_y, psi_dot) of the vehicle's origin, see `Motion`."""
+        """(x, y, psi) and (v_x, v_y, psi_dot) of the vehicle's origin, see `FreeBody`."""
         at_imu, arm = mean[7:10], jnp.asarray(self.lever_arm_m, mean.dtype)
         velocity = at_imu - jnp.cross(mean[10:13], arm)
         return FreeBody.on_ground(self, mean.at[7:10].set(velocity))

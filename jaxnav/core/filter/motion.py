@@ -194,10 +194,6 @@ class Motion(eqx.Module):
         """The pose of a mean."""
 
     @abc.abstractmethod
-    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-        """(x_m, y_m, psi_rad) of a mean in the world, and their derivatives."""
-
-    @abc.abstractmethod
     def for_rig(self, rig: CameraRig, hypotheses: int) -> "Motion":
         """The model with the errors of this rig's cameras among its states, and of the sensors.
 
@@ -225,17 +221,14 @@ class Motion(eqx.Module):
             covariance.at[states:, states:].set(block),
         )
 
+    @abc.abstractmethod
     def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "d d"]) -> Planar:
-        """Pose and velocity on the ground: J P J' with the Jacobians of `on_ground`.
+        """Pose and velocity on the ground, with their covariances.
 
         Args:
             mean: (n,) as the model stores it.
             covariance: (d, d) of the error state.
         """
-        P, still = covariance, jnp.zeros(covariance.shape[0], mean.dtype)
-        slopes = jax.jacfwd(lambda error: self.on_ground(self.moved(mean, error)))(still)
-        (pose, velocity), (J_pose, J_velocity) = self.on_ground(mean), slopes
-        return Planar(pose, sandwich(J_pose, P), velocity, sandwich(J_velocity, P))
 
     def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
         """The posterior of every hypothesis (Eqs. 10 and 11), with those merged that are one.

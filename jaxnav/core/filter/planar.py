@@ -265,10 +265,6 @@ class BicycleKalman(Motion):
         """The pose of a mean, level on the ground."""
         return T_world_vehicle_from_planar(mean[:3])
 
-    def on_ground(self, mean: Float[Array, " n"]) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
-        """The two halves of the state: pose and velocity, (3,) each."""
-        return mean[:3], mean[3:SIX]
-
     def planar(self, mean: Float[Array, " n"], covariance: Float[Array, "n n"]) -> Planar:
         """Pose and velocity as they stand in the state, which is planar."""
         return Planar(mean[:3], covariance[:3, :3], mean[3:SIX], covariance[3:SIX, 3:SIX])

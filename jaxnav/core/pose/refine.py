@@ -37,7 +37,7 @@ from jaxnav.core.pose.pair_lanes import solve_pairs
 from jaxnav.core.pose.residuals import (
     Nuisance,
     Rows,
-    camera_errors,
+    camera_slopes,
     cross_product,
     pinhole_rows,
     reprojection_rows,
@@ -166,7 +166,8 @@ def refine_sightings(
     if wanted is not None:
         constrained = constrained & wanted
 
-    nuisance = camera_errors(rig, markers, seen)
+    moves = camera_slopes(rig, markers, seen)
+    nuisance = None if moves is None else moves.nuisance()
     T, solution = _minimise(start, rows, free, constrained, max_steps, nuisance)
     chart = _chart(T, corners_world, center_world)
     residual, normal = chart.linearised(rows, free, nuisance)(

@@ -273,15 +273,6 @@ class CameraSlopes(eqx.Module):
         return Nuisance.from_slopes(jnp.concatenate([self.places, self.turns])[..., None])
 
 
-def camera_errors(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> Nuisance | None:
-    """The cameras' errors in place and direction, with the prior of `rig.extrinsics_sigma`.
-
-    None where the cameras are exact. The nuisance has a single lane, for all poses.
-    """
-    moves = camera_slopes(rig, markers, seen)
-    return None if moves is None else moves.nuisance()
-
-
 def camera_slopes(rig: CameraRig, markers: MarkerMap, seen: Sightings) -> CameraSlopes | None:
     """The derivatives of the residuals by each camera's error; None where the cameras are exact.
 

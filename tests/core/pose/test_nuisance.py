@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import sightings
 from jaxnav.core.pose.refine import Candidates, refine_pose
-from jaxnav.core.pose.residuals import Nuisance, camera_errors
+from jaxnav.core.pose.residuals import Nuisance, camera_slopes
 from tests import worlds
 from tests.derivatives import check_derivatives
 
@@ -148,7 +148,7 @@ def test_the_slopes_are_differences_of_projections(slots):
     seen = jax.jit(sightings, static_argnums=5)(
         rig, markers, obs.corners_px, jnp.asarray(visible), SIGMA_PX, slots
     )
-    nuisance = jax.jit(camera_errors)(known, markers, seen)
+    nuisance = jax.jit(lambda *seen: camera_slopes(*seen).nuisance())(known, markers, seen)
     assert nuisance is not None
     count = min(slots, 4)
     assert nuisance.slopes.shape == (6, 8 * slots, count, 1)
@@ -187,7 +187,7 @@ def test_the_slopes_are_differences_of_projections(slots):
 def test_exact_cameras_have_no_nuisance():
     rig, markers = worlds.qcar_rig(), worlds.room_markers()
     obs = worlds.observe(rig, markers, worlds.planar(*VIEW))
-    assert camera_errors(rig, markers, sightings(rig, markers, obs.corners_px, obs.visible)) is None
+    assert camera_slopes(rig, markers, sightings(rig, markers, obs.corners_px, obs.visible)) is None
 
 
 # --- poses found with them ------------------------------------------------------------
