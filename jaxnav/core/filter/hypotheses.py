@@ -391,11 +391,10 @@ class MultiHypothesis(eqx.Module):
             *predicted, of_errors, prior, snapshot, floor, self.max_steps, elsewhere=tried
         )
         alive = bank.initialised & fits.finite
-        posteriors, log_evidence, inflation = self._inflated(
-            fits, candidates.least_cost, alive, starts
-        )
+        free_cost = candidates.least_cost
+        posteriors, log_evidence, inflation = self._inflated(fits, free_cost, alive, starts)
         least_cost = jnp.min(jnp.where(alive, fits.cost, jnp.inf))
-        fits_one = starts | (least_cost - candidates.least_cost < self.gate)
+        fits_one = starts | (least_cost - free_cost < self.gate)
         nis = jnp.sum(posteriors.innovation**2, axis=1)
         passes = starts | (nis <= prior.gate_nis * inflation)
         # What one frame subtracts from a log-weight is bounded.
