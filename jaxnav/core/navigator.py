@@ -175,11 +175,11 @@ class Navigator(eqx.Module):
         return belief, Estimate.from_belief(self.motion, belief, evidence)
 
     def look(self, obs: Observation) -> ConsistentSnapshot:
-        """The candidate poses of an observation, without sightings that can be no marker."""
+        """Find the candidate poses of an observation; leave out what can be no marker."""
         return remove_outliers(self.snapshot(obs), self.find_candidates, self.no_candidates())
 
     def predict(self, belief: Belief, obs: Observation) -> Belief:
-        """The belief `obs.dt_s` later (Eq. 9), with the odometry fused where there is any."""
+        """Predict the belief `obs.dt_s` later (Eq. 9), and fuse the odometry, if there is any."""
         bank = self.motion.sound(self.motion.predict(belief.bank, obs))
         given_up = jnp.any(belief.bank.initialised) & ~jnp.any(bank.initialised)
         return replace(belief, bank=bank, restarts=belief.restarts + given_up)
@@ -206,7 +206,7 @@ class Navigator(eqx.Module):
         return belief, evidence
 
     def coast(self, belief: Belief) -> tuple[Belief, Evidence]:
-        """The predicted belief as the next one, where no marker is in view."""
+        """Carry a predicted belief on, where no marker is in view."""
         located = jnp.any(belief.bank.initialised)
         coasted = replace(
             belief,

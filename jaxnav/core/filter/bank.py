@@ -43,7 +43,7 @@ class CameraErrors(eqx.Module):
     cross: Float[Array, "*K 6 e"]  # with xi in T_world_vehicle * exp(xi)
 
     def fresh(self) -> "CameraErrors":
-        """The errors of which nothing is known but the prior."""
+        """Errors of which nothing is known but the prior."""
         eye = jnp.eye(self.mean.shape[-1], dtype=self.mean.dtype)
         return CameraErrors(
             jnp.zeros_like(self.mean),
@@ -129,7 +129,7 @@ def heaviest(bank: Bank) -> Int[Array, ""]:
 def known_to(
     bank: Bank, apart_rad: Float[Array, " K"], variance: Float[Array, " K"]
 ) -> Float[Array, ""]:
-    """Second moment of an angle over a bank, about the reported hypothesis, rad^2.
+    """How well a bank knows an angle: its second moment about the reported hypothesis, rad^2.
 
     Args:
         apart_rad: of each hypothesis from the reported one.
@@ -152,7 +152,7 @@ def mixture_log_mean(bank: Bank, log_values: Float[Array, " K"]) -> Float[Array,
 
 
 def forget_lost(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | float) -> Bank:
-    """The predicted bank without those that are `lost`, which a pose starts anew.
+    """Drop the hypotheses that are `lost` from a predicted bank; a pose starts them anew.
 
     Every slot continues itself.
 
@@ -178,12 +178,12 @@ def contradicted(
 
 
 def cleared(rejections: Rejections, over: Bool[Array, "*K"]) -> Rejections:
-    """The rejections, forgotten where they are over."""
+    """Forget the rejections that are over."""
     return where(over, jax.tree.map(jnp.zeros_like, rejections), rejections)
 
 
 def branched(bank: Bank, parent: Int[Array, " K"]) -> Bank:
-    """The bank whose slots continue their parents; a copy of another slot gets a new number."""
+    """Copy each slot's parent into it; a copy of another slot gets a new number."""
     copied = parent != jnp.arange(parent.shape[0])
     anew = jnp.max(jnp.where(bank.initialised, bank.number, -1)) + jnp.cumsum(copied)
     number = jnp.where(copied, anew, bank.number)
@@ -228,7 +228,7 @@ def renumber_if_empty(bank: Bank) -> Bank:
 
 
 def restart_broken(bank: Bank, start: Bank) -> Bank:
-    """The bank with `start` in place of hypotheses whose mean or covariance is not finite."""
+    """Start hypotheses anew whose mean or covariance is not finite."""
     hypotheses = (bank.mean, bank.covariance.reshape(*bank.mean.shape[:1], -1))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(hypotheses, axis=1)), axis=1)
     return dataclasses.replace(where(finite, bank, start), number=bank.number)
@@ -316,7 +316,7 @@ def merge_hypotheses(
     difference: Callable[[Float[Array, " n"], Float[Array, " n"]], Float[Array, " d"]],
     moved: Callable[[Float[Array, " n"], Float[Array, " d"]], Float[Array, " n"]],
 ) -> Bank:
-    """The bank with those that merge replaced by one Gaussian of the same two moments.
+    """Merge hypotheses into one Gaussian of the same two moments.
 
     Args:
         bank: after the update, with the weights after it.

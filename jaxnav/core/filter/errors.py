@@ -172,7 +172,7 @@ def schmidt_update_along(
     correction: Float[Array, " n"],
     P: Float[Array, "n n"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """A correction and its covariance in which some directions of the errors are only considered.
+    """Leave some directions of the errors as they were before a correction (Schmidt).
 
     Args:
         directions: orthonormal, of the e errors at the end of the state; or 0.
@@ -247,7 +247,7 @@ class Nuisances(eqx.Module):
         return self.in_view.offset(), self.in_view.with_pose()
 
     def eliminated(self, rows: Float[Array, "*n m K"]) -> Float[Array, "*n rows K"]:
-        """Residuals, or derivatives of them: moved, and the priors' own rows below."""
+        """Eliminate the errors from residuals, or from derivatives; their priors add rows."""
         for part in (self.places, self.cameras, self.vehicle):
             rows = rows if part is None else part.eliminated(rows)
         return rows
@@ -319,7 +319,7 @@ class RepeatedErrors(eqx.Module):
     renewal_px: Float[Array, ""] | float = 40.0
 
     def begin(self, rig: CameraRig, markers: MarkerMap) -> Repeats:
-        """Nothing was seen yet."""
+        """The state before anything was seen."""
         lanes, dtype = (len(rig), len(markers.ids)), rig.cameras.focal_px.dtype
         shapes = ((*lanes, 2, 2), lanes, (*lanes, 2), lanes, (), ())
         return Repeats(*(jnp.zeros(shape, dtype) for shape in shapes))
@@ -327,7 +327,7 @@ class RepeatedErrors(eqx.Module):
     def weighed(
         self, repeats: Repeats, snapshot: Snapshot, surprise: Float[Array, ""] | float = 1.0
     ) -> Snapshot:
-        """The snapshot with the sigma of repeated sightings raised, see `surprise_of`."""
+        """Raise the sigma of sightings that repeat; see `surprise_of`."""
         seen = snapshot.seen
         s = jnp.maximum(jnp.minimum(repeats.share, self.most_share), self.least_share)
         n = (self._same(repeats, seen) * repeats.count[_lanes(seen)])[:, None] / surprise**2
@@ -342,7 +342,7 @@ class RepeatedErrors(eqx.Module):
         T_world_vehicle: jaxlie.SE3,
         known: Bool[Array, ""],
     ) -> Repeats:
-        """What is known after a snapshot.
+        """Learn from a snapshot.
 
         Args:
             T_world_vehicle: the estimate. Not the best pose of the snapshot alone: near the frontal
@@ -369,7 +369,7 @@ class RepeatedErrors(eqx.Module):
         share = jnp.where(white > 0, surely, 0) / jnp.where(white > 0, white, 1)
 
         def renewed(before: Array, now: Array) -> Array:
-            """Hidden sightings keep what was."""
+            """The table with the sightings in view; hidden ones keep what was."""
             shown = seen.visible.reshape(-1, *(1,) * (now.ndim - 1))
             return before.at[at].set(jnp.where(shown, now, before[at]).astype(dtype))
 
@@ -415,7 +415,7 @@ def surprise_of(
 
 
 def unexplained(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "D 2"]:
-    """What of residuals, in sigmas, no pose of the marker before its camera explains.
+    """The part of residuals, in sigmas, that no pose of the marker before its camera explains.
 
     To first order about the given pose: the residuals along two unit vectors that are orthogonal
     to the six derivatives by the marker's pose (Gram, Schmidt), those nearest to its diagonals

@@ -63,7 +63,7 @@ class FreeBody(Motion):
 
     @abc.abstractmethod
     def at_first(self) -> Moments:
-        """Mean and covariance of what a first pose does not tell, but for the cameras' errors."""
+        """Mean and covariance of the states behind a first pose, but for the cameras' errors."""
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
@@ -80,7 +80,7 @@ class FreeBody(Motion):
         covariance: Float[Array, "K d d"],
         dt_s: Float[Array, ""],
     ) -> Bank:
-        """The bank with the predicted moments, less hypotheses that are contradicted or nowhere."""
+        """Take over predicted moments, and drop hypotheses that are contradicted or nowhere."""
         bank = eqx.tree_at(lambda b: (b.mean, b.covariance), before, (mean, covariance))
         variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
         lost = self.lost(before) | ~(variance_m2 < self.lost_sigma_m**2)
@@ -294,7 +294,7 @@ class ConstantVelocity(FreeBody):
     def _twist_read(
         self, obs: Observation, dtype: jnp.dtype
     ) -> tuple[Bool[Array, ""], Float[Array, " 6"]]:
-        """Whether the odometry tells the motion, and its twist; 0 where it does not."""
+        """Whether the odometry reads the motion, and its twist; 0 where it does not."""
         if obs.twist is None:
             return jnp.asarray(False), jnp.zeros(6, dtype)
         twist = jnp.asarray(obs.twist, dtype)
@@ -304,7 +304,7 @@ class ConstantVelocity(FreeBody):
     def _by_odometry(
         self, errors: OdometryErrors, mean: Array, P: Array, twist: Array, dt_s: Array
     ) -> Moments:
-        """One hypothesis by odometry whose own errors are states."""
+        """Move one hypothesis by odometry whose own errors are states."""
         dtype, known = mean.dtype, mean[13 : 13 + ERRORS]
         u = errors.corrected(twist, known)
         back = jaxlie.SE3.exp(u * dt_s).inverse()
@@ -332,7 +332,7 @@ class ConstantVelocity(FreeBody):
         return jnp.block([[D * dt_s, D], [D, D * per_dt + A * dt_s / 3]])
 
     def at_first(self) -> Moments:
-        """No velocity, with `initial_velocity_sigma`; an odometry that is right, within its own."""
+        """No velocity, and odometry that is right, each within its sigma."""
         sigma = jnp.asarray(self.initial_velocity_sigma, float)
         if self.odometry_errors is not None:
             sigma = jnp.append(sigma, self.odometry_errors.sigma)

@@ -115,7 +115,7 @@ def second_poses(
     candidates: Candidates,
     least_log_weight: Float[Array, ""] | float,
 ) -> SecondPoses:
-    """The candidates that prediction and corners leave possible beside the nearest.
+    """Find the other poses of a marker that a prediction covers, beside the nearest.
 
     The nearest one is where the search from the prediction leads.
 
@@ -152,7 +152,7 @@ def second_poses(
 
 
 def give_slots(second: SecondPoses, empty: Bool[Array, " K"]) -> SecondPoses:
-    """Each second pose in an empty slot of its own, as long as there are any."""
+    """Give each second pose an empty slot of its own, as long as there are any."""
     wanted = second.wanted
     in_order = jnp.cumsum(empty)[:, None] == jnp.cumsum(wanted)[None]
     taken = in_order & empty[:, None] & wanted[None]
@@ -170,7 +170,7 @@ _CANDIDATE_LOG_WEIGHT = -5.0  # of a candidate, where a member of the fan has 0
 def fan(
     prior: PoseBelief, candidates: Candidates, snapshot: Snapshot, hypotheses: int
 ) -> PoseBelief:
-    """K hypotheses: the best candidate turned about the marker, then up to three candidates.
+    """Start a bank: the best candidate turned about the marker, then up to three candidates.
 
     The fan of a car turns about the vertical through the marker's centre, that of a free body in
     two angles. The candidates weigh little; they serve markers that do not hang upright, whose
@@ -524,7 +524,7 @@ class MultiHypothesis(eqx.Module):
         candidates: Candidates,
         snapshot: Snapshot,
     ) -> SecondPoses:
-        """The candidates for which a bank takes empty slots.
+        """Split a hypothesis whose prior covers both poses of a marker.
 
         None while the bank is open, when others stand for them, and none where all misfit.
         """
@@ -547,7 +547,7 @@ class MultiHypothesis(eqx.Module):
 def _started(
     starts: Bool[Array, ""], prior: PoseBelief, candidates: Candidates, snapshot: Snapshot
 ) -> PoseBelief:
-    """The prediction, or a new fan where no hypothesis is initialised; computed only there."""
+    """Start a new fan where no hypothesis is initialised; elsewhere it costs nothing."""
 
     def changing(bank: PoseBelief) -> tuple[Any, ...]:
         pose = bank.T_world_vehicle.wxyz_xyz, bank.covariance
@@ -562,7 +562,7 @@ def _started(
 
 
 def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
-    """The `excess_of` of the best candidate's cost; 1 without a candidate."""
+    """By how much the best candidate misfits (`excess_of`); 1 without a candidate."""
     cost = candidates.least_cost
     freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
     return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)

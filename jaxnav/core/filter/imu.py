@@ -103,14 +103,14 @@ class InertialMotion(FreeBody):
     def _imu_read(
         self, obs: Observation, dtype: jnp.dtype
     ) -> tuple[Bool[Array, ""], Preintegrated | None]:
-        """Whether the IMU tells the motion, and what it tells."""
+        """Whether the IMU read the motion in this interval, and what it read."""
         if obs.imu is None:
             return jnp.asarray(False), None
         imu, dt_s = obs.imu.usable(dtype), jnp.asarray(obs.dt_s, dtype)
         return (imu.duration_s > 0) & (jnp.abs(imu.duration_s - dt_s) < _SAME_S), imu
 
     def _coasted(self, mean: Array, P: Array, dt_s: Array) -> Moments:
-        """As `ConstantVelocity`, in the velocity of the vehicle's origin."""
+        """Move one hypothesis without a reading, as `ConstantVelocity` does."""
         dtype, across = mean.dtype, skew(jnp.asarray(self.lever_arm_m, mean.dtype))
         mean, P = _other_velocity(mean, P, across)
         mean, P = moved_by_twist(mean, P, mean[7:13], dt_s, True)
@@ -121,7 +121,7 @@ class InertialMotion(FreeBody):
         return _other_velocity(mean, P, -across)
 
     def _carried(self, mean: Array, P: Array, imu: Preintegrated) -> Moments:
-        """As the IMU tells."""
+        """Move one hypothesis by the IMU."""
         dtype, states = mean.dtype, self.states
         after = self._after(mean, jnp.zeros(15, dtype), imu)
 

@@ -44,6 +44,8 @@ from jaxtyping import Array, Bool, DTypeLike, Float, Int
 from jaxnav.core.linalg.small_matrices import matvec, product, sandwich
 from jaxnav.core.models.geometry import rotation_matrix, safe_norm, safe_sinc, skew
 
+_Sums = tuple[Array, Array, Array, Array, Array]
+
 _G_MPS2 = 9.80665  # standard gravity, in which data sheets count
 
 
@@ -260,9 +262,7 @@ def preintegrate(
     bridged_s = jnp.sum(jnp.where(readings.bridged, readings.dt_s, 0))
     per_bridged = noise.bridged_variances().astype(dtype) * bridged_s
 
-    def step(
-        carry: tuple[Array, ...], row: tuple[Array, Array, Array, Array]
-    ) -> tuple[tuple[Array, ...], None]:
+    def step(carry: _Sums, row: tuple[Array, Array, Array, Array]) -> tuple[_Sums, None]:
         wxyz, v, p, P, chain = carry
         gyro, accel, dt, bridged = row
         dR = jaxlie.SO3(wxyz)

@@ -76,7 +76,7 @@ class Vehicle(eqx.Module):
 
     @property
     def dtype(self) -> jnp.dtype:
-        """Of its numbers."""
+        """The precision of its numbers."""
         return self.wheelbase_m.dtype
 
 
@@ -178,7 +178,7 @@ class TwistBase(eqx.Module):
 
     @property
     def dtype(self) -> jnp.dtype:
-        """Of its numbers."""
+        """The precision of its numbers."""
         return self.time_constant_s.dtype
 
     @property
@@ -211,7 +211,7 @@ DEFAULT_TURN_SIGMA_RAD = float(np.deg2rad(1.0))
 def default_odometry_sigma(
     scale: float = DEFAULT_SCALE_SIGMA, turn_rad: float = DEFAULT_TURN_SIGMA_RAD
 ) -> Float[np.ndarray, " 4"]:
-    """(k, m) of plain numbers."""
+    """Standard deviations of an odometry's scale k and of its turn m about each axis."""
     return np.asarray([scale, turn_rad, turn_rad, turn_rad])
 
 
@@ -225,7 +225,7 @@ class OdometryErrors(eqx.Module):
     def create(
         sigma: Float[np.ndarray, " 4"], lever_arm_m: Float[np.ndarray, " 3"]
     ) -> "OdometryErrors":
-        """Of plain numbers, in the process's precision."""
+        """From plain numbers, in the process's precision."""
         return OdometryErrors(jnp.asarray(sigma, float), jnp.asarray(lever_arm_m, float))
 
     def corrected(

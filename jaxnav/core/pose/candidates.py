@@ -44,7 +44,7 @@ def find_candidates(
     ground_plane: bool = False,
     own: jaxlie.SE3 | None = None,
 ) -> Candidates:
-    """Every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
+    """Find every candidate pose, refined on the joint e1 of all sightings, equal ones merged.
 
     One camera that sees one marker gives two; two cameras on one marker give up to four, which
     the refinement usually draws together into two (see docs/design.md, Candidates). With many
@@ -206,7 +206,7 @@ class Inliers(NamedTuple):
 
 
 def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSnapshot:
-    """The snapshot without sightings that are not squares and without an outvoted marker.
+    """Leave out sightings that are not squares, and a marker that the others outvote.
 
     With three markers and more in view, the one without which the joint misfit falls below a
     bound, by a factor that no other marker reaches, is outvoted.

@@ -252,7 +252,7 @@ class Nuisance(eqx.Module):
         return -jnp.sum(self.gains * residuals[None, :, None], axis=1)
 
     def eliminated(self, rows: Float[Array, "*n m N"]) -> Float[Array, "*n rows N"]:
-        """Residuals, or derivatives of them: moved, and the prior's own rows below."""
+        """Eliminate the error from residuals, or from derivatives of them; its prior adds rows."""
         if rows.ndim == 3:
             return jax.vmap(self.eliminated)(rows)
         best = self.at_best(rows)
@@ -269,7 +269,7 @@ class CameraSlopes(eqx.Module):
     in_view: Bool[Array, " g"]  # False: the group is empty
 
     def nuisance(self) -> Nuisance:
-        """Both, new in every frame, with a single lane for all poses."""
+        """Both as a nuisance that is new in every frame, with a single lane for all poses."""
         return Nuisance.from_slopes(jnp.concatenate([self.places, self.turns])[..., None])
 
 
