@@ -9,7 +9,7 @@ from jaxnav.drive.flags import names
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
 from jaxnav.vehicles.conformance.faults import HEADER, Result, Trial, line, run_trial
-from jaxnav.vehicles.conformance.matrix import matrix
+from jaxnav.vehicles.conformance.matrix import MATRIX
 
 EXIT_BROKEN = 1
 
@@ -23,7 +23,7 @@ def run(args: Faults) -> int:
         load_markers(args.markers or qcar / "markers.yaml"),
         load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
     )
-    suiting = [row for row in matrix() if row.suits(trial)]
+    suiting = [row for row in MATRIX if row.suits(trial)]
     rows = [row for row in suiting if not args.only or any(p in row.name for p in args.only)]
     if not rows:
         known = ", ".join(row.name for row in suiting)

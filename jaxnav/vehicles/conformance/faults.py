@@ -1,6 +1,6 @@
 """Run the fault matrix: the faults that can occur on a drive, and the required results.
 
-    for row in matrix():
+    for row in MATRIX:
         print(line(run_trial(row, trial)))
 
 All faults act on corners, in lockstep drives of the simulated car, or of another base, through a

@@ -78,6 +78,34 @@ def stamps(edit: Callable[[int], int]) -> EditFrame:
     return lambda frame: dataclasses.replace(frame, stamp_ns=edit(frame.stamp_ns))
 
 
+def renamed(frame: FrameDetections) -> FrameDetections | None:
+    """Give the markers other ids."""
+    return detections(lambda seen: dataclasses.replace(seen, ids=seen.ids + 7))(frame)
+
+
+def doubled(shift_px: float) -> EditFrame:
+    """Show every marker once more, so far away."""
+
+    def edit(seen: Detections) -> Detections:
+        other = dataclasses.replace(seen, corners_px=seen.corners_px + shift_px)
+        return Detections.concatenate([seen, other])
+
+    return detections(edit)
+
+
+def mirrored(corners_px: Float[np.ndarray, "N 4 2"]) -> Float[np.ndarray, "N 4 2"]:
+    """Mirror each marker's corners (N, 4, 2) about its middle."""
+    center = corners_px.mean(axis=1, keepdims=True)
+    x, y = 2 * center[..., 0] - corners_px[..., 0], corners_px[..., 1]
+    return np.stack([x, y], axis=-1)[:, [1, 0, 3, 2]]
+
+
+def random_corners() -> Change:
+    """Put all corners anywhere."""
+    rng = np.random.default_rng(0)
+    return frames(corners(lambda c: rng.uniform([0, 0], [820, 410], c.shape)))
+
+
 def nothing_seen(frame: FrameDetections) -> FrameDetections:
     """Make a frame show no marker: a tunnel, a black or a white image."""
     return dataclasses.replace(frame, detections=Detections.concatenate([]))
@@ -148,6 +176,40 @@ def speed(edit: Callable[[float], float]) -> EditOdometry:
         return reading_of(reading.stamp_ns, tuple(map(edit, reading.values)), reading.valid)
 
     return edited
+
+
+def neither(given: Input) -> list[Input]:
+    """Lose frames and readings."""
+    return [dataclasses.replace(given, odometry=None, frames=())]
+
+
+def drifting_clocks() -> Change:
+    """Let the clocks of cameras and odometer drift by 100 ppm."""
+
+    def drifting(ns: int) -> int:
+        return ns + int((ns - BEGIN_NS) * 100e-6)
+
+    def reading(read: Odometry) -> Odometry:
+        return dataclasses.replace(read, stamp_ns=drifting(read.stamp_ns))
+
+    return both(frames(stamps(drifting)), odometry(reading))
+
+
+def invalid(reading: Odometry) -> Odometry:
+    """Say of a reading that it is invalid."""
+    return dataclasses.replace(reading, valid=False)
+
+
+def spiking() -> EditOdometry:
+    """Measure ten times the speed in each fifth reading."""
+    calls = itertools.count(1)
+    return speed(lambda mps: (1.0 if next(calls) % 5 else 10.0) * mps)
+
+
+def noise() -> Callable[[float], float]:
+    """A gyro's rates with noise of 1 rad/s."""
+    rng = np.random.default_rng(0)
+    return lambda rate_radps: rate_radps + float(rng.standard_normal())
 
 
 def gyro(edit: Callable[[float], float]) -> Change:

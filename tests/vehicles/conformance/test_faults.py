@@ -25,7 +25,7 @@ from jaxnav.sim.sensor import Sensor
 from jaxnav.vehicles.conformance import injections as inject
 from jaxnav.vehicles.conformance.faults import WAYPOINTS_M, FaultRow, Trial, line, run_trial
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, drive
-from jaxnav.vehicles.conformance.matrix import matrix
+from jaxnav.vehicles.conformance.matrix import MATRIX
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 
@@ -76,7 +76,7 @@ def trials(request) -> Iterator[dict[str, Trial]]:
         yield made | {"omni": dataclasses.replace(made["omni"], program=shared)}
 
 
-ROWS = matrix()
+ROWS = MATRIX
 # One of each kind, for every change; `make test-all` drives them all.
 OFTEN = {
     "none", "tunnel, 5 s", "camera 0 out", "frozen images, new stamps", "odometry stuck",
@@ -176,7 +176,7 @@ def test_a_picture_that_freezes_does_not_lead_the_car_astray(trial):
 
 def test_what_is_asked_of_a_fault_can_be_missed(trial):
     """The same measure finds fault with a drive in which the wrong thing is asked for."""
-    tunnel = next(row for row in matrix() if row.name == "tunnel, 5 s")
+    tunnel = next(row for row in MATRIX if row.name == "tunnel, 5 s")
     asked = dataclasses.replace(
         tunnel,
         faults=Fault.ODOMETRY_STUCK,
@@ -191,10 +191,10 @@ def test_what_is_asked_of_a_fault_can_be_missed(trial):
 
 
 def test_rows_have_names_of_their_own():
-    names = [row.name for row in matrix()]
+    names = [row.name for row in MATRIX]
     assert len(set(names)) == len(names)
     assert set(names) >= OFTEN
-    assert all(isinstance(row, FaultRow) and np.isfinite(row.drive_s) for row in matrix())
+    assert all(isinstance(row, FaultRow) and np.isfinite(row.drive_s) for row in MATRIX)
 
 
 def test_a_fault_that_is_not_there_is_one_line(capsys, monkeypatch):
