@@ -122,15 +122,14 @@ def _dispatch(args: list[str], *signals: Signals) -> int:
 
         print(f"jaxnav {__version__}")
         return 0
-    from jaxnav.commands import registered
-    from jaxnav.commands.outputs import check_outputs
+    from jaxnav.commands import check_outputs, command_of
 
     command = _parse(args)
     if command is None:
         return 0
     check_outputs(command)
     try:
-        module = importlib.import_module(f"jaxnav.commands.{registered(command).module}")
+        module = importlib.import_module(f"jaxnav.commands.{command_of(command).module}")
         with nothing_hidden():
             code: int = module.run(command, *signals)
     except ModuleNotFoundError as missing:
@@ -174,9 +173,9 @@ def _parse(args: list[str]) -> Any:
     import tyro
 
     from jaxnav.commands import all_arguments
-    from jaxnav.commands.old_flags import with_new_names
+    from jaxnav.commands.kinds import check_values
 
-    args, words = _without_ros_args(with_new_names(args))
+    args, words = _without_ros_args(args)
     messages = io.StringIO()
     wide = not {"-h", "--help"} & set(args)
     try:
@@ -191,6 +190,7 @@ def _parse(args: list[str]) -> Any:
                 args=args,
             )
             command = getattr(command, "what", command)  # of a group
+            check_values(command)
             return dataclasses.replace(command, ros_args=words) if words else command
     except SystemExit as finished:
         if not finished.code:

@@ -1,13 +1,13 @@
-"""Kinds of values that several commands are told, and what is asked of them."""
+"""Types of the flags that several commands share, and what their values must be."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+from annotated_types import Ge, Gt, Lt
 
 from jaxnav.errors import BadInput
 
@@ -51,33 +51,52 @@ Switch = tyro.conf.FlagCreatePairsOff[bool]
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is asked of the values of a field that has this in its annotation.
+class Within:
+    """The range of a quantity in `jaxnav.files.ranges`, which is read when a value is checked, as
+    `--help` is to load no NumPy."""
 
-    Attributes:
-        check: called with flag and value; raises BadInput.
+    name: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from jaxnav.files.ranges import within
+
+        return within(self.name).__get_pydantic_core_schema__(source, handler)
+
+
+Count = Annotated[int, Ge(1)]
+Seed = Annotated[int, Ge(0)]
+Positive = Annotated[float, Gt(0), Lt(math.inf)]
+NotNegative = Annotated[float, Ge(0), Lt(math.inf)]
+CornerSigma = Annotated[float, Within("corner_sigma_px")]
+SizeM = Annotated[float, Within("size_m")]
+
+
+def check_values(command: Any) -> None:
+    """Hold the arguments of a command against their types.
+
+    What does not go together a command's class refuses by itself, in its `__post_init__`.
+
+    Raises:
+        BadInput: names the first flag whose value is out of its range.
     """
+    from pydantic import TypeAdapter, ValidationError  # not for --help
 
-    check: Callable[[str, Any], None]
+    for field in fields(command):
+        try:
+            TypeAdapter(field.type).validate_python(getattr(command, field.name))
+        except ValidationError as invalid:
+            error = invalid.errors(include_url=False)[0]
+            problem = error["msg"]
+            for words, plainer in _PLAINER.items():
+                problem = problem.replace(words, plainer)
+            got = "" if "got" in problem else f", got {error['input']}"
+            raise BadInput(flag_of(field.name), f"{problem}{got}") from None
 
 
-@dataclass(frozen=True)
-class Checked:
-    """The arguments of a command; BadInput where a value is not what its field's annotation asks
-    for, or where values don't go together."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            given = getattr(self, field.name)
-            for asked in getattr(field.type, "__metadata__", ()):
-                if isinstance(asked, Asked):
-                    for value in given if isinstance(given, tuple) else (given,):
-                        if value is not None:
-                            asked.check(flag_of(field.name), value)
-        self._check()
-
-    def _check(self) -> None:
-        """Raise BadInput where values don't go together."""
+_PLAINER = {
+    "Value error, ": "", "Input should": "must", "greater than or equal to": "at least",
+    "less than or equal to": "at most", "less than inf": "finite",
+}  # fmt: skip
 
 
 def flag_of(name: str) -> str:
@@ -125,40 +144,6 @@ def key_values(flag: str, texts: Sequence[str], expected: str = "KEY=VALUE") -> 
     return values
 
 
-def _require_at_least(flag: str, value: int, least: int) -> None:
-    bound = "not be negative" if least == 0 else f"be at least {least}"
-    require(value >= least, flag, f"must {bound}, got {value}")
-
-
-def _require_finite(flag: str, value: float, zero_allowed: bool = False) -> None:
-    large_enough = value >= 0 if zero_allowed else value > 0
-    bound = "not be negative" if zero_allowed else "be positive"
-    require(math.isfinite(value) and large_enough, flag, f"must {bound} and finite, got {value}")
-
-
-def _require_within(flag: str, value: float, name: str) -> None:
-    from jaxnav.files.ranges import RANGES, problem_of  # NumPy: not for --help
-
-    if RANGES[name].least > 0:
-        _require_finite(flag, value)
-    problem = problem_of(name, value)
-    require(problem is None, flag, problem or "")
-
-
-def within(name: str) -> Asked:
-    """What a file may hold of the same quantity, whose name stands in `jaxnav.files.ranges`."""
-    return Asked(partial(_require_within, name=name))
-
-
-POSITIVE = Asked(_require_finite)
-AT_LEAST_1 = Asked(partial(_require_at_least, least=1))
-Count = Annotated[int, AT_LEAST_1]
-NotNegativeCount = Annotated[int, Asked(partial(_require_at_least, least=0))]
-Seed = NotNegativeCount
-Positive = Annotated[float, POSITIVE]
-NotNegative = Annotated[float, Asked(partial(_require_finite, zero_allowed=True))]
-CornerSigma = Annotated[float, within("corner_sigma_px")]
-
 _QCAR = "FILE", "(default: the QCar's)", None
 QCarFile = Annotated[Path | None, optional(*_QCAR)]
 OptionalFile = Annotated[Path | None, optional("FILE")]
@@ -185,20 +170,13 @@ Following = Annotated[
     ),
 ]
 Float64 = Annotated[Switch, tyro.conf.arg(help="Estimate in double precision.")]
+Headless = Annotated[Switch, tyro.conf.arg(help="No progress bar.")]
 ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for the results.")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Headless(Checked):
-    """What every command is told that shows how far it is."""
-
-    headless: Switch = False
-    """No progress bar."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScenarioCarFiles(Headless):
-    """What every command is told that drives through scenarios: its car, in files or by name."""
+class ScenarioCarFiles:
+    """Arguments of every command that drives through scenarios: its car, in files or by name."""
 
     base: Base = "ackermann"
     """What drives: the vehicle, or a base of the QCar's size that is commanded by a twist."""
@@ -210,7 +188,8 @@ class ScenarioCarFiles(Headless):
     vehicle: QCarVehicle = None
     route: Annotated[Path | None, optional("FILE", "(default: the scenario's own)")] = None
     """Start and waypoints that go with another marker map."""
+    headless: Headless = False
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         named = self.base == "ackermann" or self.vehicle is None
         require(named, "--base", f"{self.base} takes the place of --vehicle: give one of them")

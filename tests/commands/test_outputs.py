@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.commands import COMMANDS, outputs
+from jaxnav.commands import COMMANDS, OUTPUTS
 from jaxnav.errors import BadInput
 from jaxnav.files import atomic_path, atomic_write
 from jaxnav.files.locking import sole_writer
@@ -116,11 +116,11 @@ def test_every_command_that_writes_is_in_the_table():
     for name, one in COMMANDS.items():
         if name == "calibrate convert":
             continue
-        hints = typing.get_type_hints(one.kind)
+        hints = typing.get_type_hints(one.arguments)
         writes = {
             field.name
-            for field in dataclasses.fields(one.kind)
-            if field.name in outputs._OUTPUTS and Path in (hints[field.name],
+            for field in dataclasses.fields(one.arguments)
+            if field.name in OUTPUTS and Path in (hints[field.name],
                                                            *typing.get_args(hints[field.name]))
         }  # fmt: skip
         assert bool(writes) == bool(one.in_folder or one.file or one.made), name

@@ -7,27 +7,28 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Ge, Interval
 
 from jaxnav.commands.kinds import (
-    POSITIVE,
-    Checked,
     CornerBackend,
     Headless,
     OptionalFile,
     Positive,
     QCarFile,
     ResultsFolder,
+    SizeM,
     Switch,
+    Within,
     flag_of,
     optional,
     require,
-    within,
 )
 
 CalibrationFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision", "wpilib"]
 WPILibFamily = Literal["tag16h5", "tag25h9", "tag36h11"]
 
-_Angle = Annotated[float, within("angle_deg")]
+_Angle = Annotated[float, Within("angle_deg")]
+_Place = Annotated[float, Within("position_m")]
 _NAMED = re.compile(r"([A-Za-z_][\w.\-]{0,99})=(.+)")
 _Count = Annotated[int | None, optional("INT", "(default: as the target and the paper suggest)")]
 Recordings = Annotated[
@@ -38,14 +39,13 @@ Recordings = Annotated[
     ),
 ]
 MarkerSize = Annotated[
-    float | None,
+    SizeM | None,
     tyro.conf.arg(
         metavar="S",
         constructor=float,
         help_behavior_hint="(default: as of the known ones)",
         help="Side of the markers that are not in that file.",
     ),
-    within("size_m"),
 ]
 Family = Annotated[
     str | None,
@@ -63,7 +63,7 @@ _RecordedFile = Annotated[Path | None, optional("FILE", "(default: the recording
 
 
 @dataclass(frozen=True)
-class CalibrateBoard(Checked):
+class CalibrateBoard:
     """Print a calibration target at true scale, with rulers on it to check the print.
 
     A charuco board is the best for a single camera: it may be cut off by the image's edge, so its
@@ -84,14 +84,14 @@ class CalibrateBoard(Checked):
     rows: _Count = None
     """Squares or tags one above the other."""
     size_m: Annotated[
-        float | None, optional("FLOAT", "(default: the largest round size that fits)"), POSITIVE
+        Positive | None, optional("FLOAT", "(default: the largest round size that fits)")
     ] = None
     """Side of a square, or of the black outline of a tag or marker, m."""
     marker_size_m: Annotated[
-        float | None, optional("FLOAT", "(default: a cell of white around it)"), POSITIVE
+        Positive | None, optional("FLOAT", "(default: a cell of white around it)")
     ] = None
     """Of a charuco board, the side of its markers, m."""
-    spacing: float = 0.3
+    spacing: Annotated[float, Interval(gt=-math.inf, lt=math.inf)] = 0.3
     """Of an aprilgrid, the gap between tags in sides of a tag: Kalibr's tagSpacing."""
     family: Annotated[str | None, optional("NAME", "(default: 4x4 for charuco, else tag36h11)")] = (
         None
@@ -101,11 +101,11 @@ class CalibrateBoard(Checked):
     """Of the markers, which are numbered on from there."""
     border_cells: int = 2
     """Of an aprilgrid, how wide the tags' black frame is; Kalibr reads 2."""
-    dpi: int = 300
+    dpi: Annotated[int, Interval(ge=50, le=2400)] = 300
     """Pixels an inch of the PNG."""
     out: ResultsFolder = Path("calibrated")
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         named = self.paper.lower() in ("a4", "a3", "letter")
         known = named or self.paper_size_mm is not None
         require(
@@ -120,8 +120,6 @@ class CalibrateBoard(Checked):
         require(alone, "--columns", "and --rows go with boards, not with a single marker")
         pair = self.marker_size_m is None or self.size_m is not None
         require(pair, "--marker-size-m", "needs --size-m")
-        require(math.isfinite(self.spacing), "--spacing", f"must be finite, got {self.spacing}")
-        require(50 <= self.dpi <= 2400, "--dpi", f"must be from 50 to 2400, got {self.dpi}")
 
     @property
     def paper_size_mm(self) -> tuple[float, float] | None:
@@ -131,7 +129,7 @@ class CalibrateBoard(Checked):
 
 
 @dataclass(frozen=True)
-class CalibrateIntrinsics(Headless):
+class CalibrateIntrinsics:
     """Find a camera's focal length, centre and lens from pictures of a board.
 
     Show the camera a board of `jaxnav calibrate board`: 20 to 40 pictures or a slow video, tilted
@@ -145,7 +143,7 @@ class CalibrateIntrinsics(Headless):
     """
 
     sources: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
+        tyro.conf.Positional[tuple[Path, ...]],
         tyro.conf.arg(metavar="SOURCE", help_behavior_hint="(required)"),
     ]
     """Images, folders of images, videos. Of several cameras at once: front=DIR left=DIR ..."""
@@ -156,21 +154,21 @@ class CalibrateIntrinsics(Headless):
     it was not fitted to."""
     name: str = "camera"
     """Of the camera, where the sources don't say it."""
-    max_views: int = 100
+    max_views: Annotated[int, Ge(8)] = 100
     """Of more views those are taken that tell most about the lens."""
     rig: OptionalFile = None
     """A rig file that says where the cameras are; its other cameras go along unchanged."""
     out: ResultsFolder = Path("calibrated")
+    headless: Headless = False
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         require(bool(self.sources), "SOURCE", "give images, a folder of images or a video")
-        require(self.max_views >= 8, "--max-views", f"must be at least 8, got {self.max_views}")
         require(
             _NAMED.fullmatch(f"{self.name}=x") is not None,
             "--name",
             f"must be a name (a letter first, then letters, digits and _ - .), got {self.name!r}",
         )
-        named = [_NAMED.fullmatch(source) is not None for source in self.sources]
+        named = [_NAMED.fullmatch(str(source)) is not None for source in self.sources]
         require(
             all(named) or not any(named),
             "SOURCE",
@@ -182,14 +180,14 @@ class CalibrateIntrinsics(Headless):
         """The sources of every camera, in the order they were given in."""
         paths: dict[str, tuple[Path, ...]] = {}
         for source in self.sources:
-            match = _NAMED.fullmatch(source)
+            match = _NAMED.fullmatch(str(source))
             name, path = match.groups() if match else (self.name, source)
             paths[name] = (*paths.get(name, ()), Path(path))
         return paths
 
 
 @dataclass(frozen=True)
-class CalibrateAdopt(Headless):
+class CalibrateAdopt:
     """Write what a drive has learnt of its cameras and sensors into a new rig and a new vehicle.
 
     While it drives, the estimator learns by how much each camera is turned, and how far the
@@ -207,10 +205,11 @@ class CalibrateAdopt(Headless):
     vehicle: _RecordedFile = None
     """The vehicle that it was driven with."""
     out: ResultsFolder = Path("adopted")
+    headless: Headless = False
 
 
 @dataclass(frozen=True)
-class CalibrateConvert(Checked):
+class CalibrateConvert:
     """Convert cameras and marker maps between jaxnav's files and those of other tools.
 
     Which tool wrote SOURCE, its keys tell. Numbers are carried over as they are written; what the
@@ -227,9 +226,7 @@ class CalibrateConvert(Checked):
     one of its own, their folder."""
     camera_name: Annotated[str | None, optional("NAME")] = None
     """Which camera, where SOURCE has several; what to call it, where SOURCE has one."""
-    position_m: Annotated[
-        tuple[float, float, float] | None, optional("X Y Z"), within("position_m")
-    ] = None
+    position_m: Annotated[tuple[_Place, _Place, _Place] | None, optional("X Y Z")] = None
     """Where the camera is on the vehicle, if SOURCE does not say so: forward, left, up."""
     yaw_deg: _Angle = 0.0
     """With --position-m: 0 looks forward, 90 to the left."""
@@ -237,22 +234,18 @@ class CalibrateConvert(Checked):
     """With --position-m: positive looks up."""
     roll_deg: _Angle = 0.0
     """With --position-m: positive is clockwise as seen from behind the camera."""
-    marker_size_m: Annotated[
-        float | None, optional("FLOAT", "(default: FIRST's, 0.1651)"), within("size_m")
-    ] = None
+    marker_size_m: Annotated[SizeM | None, optional("FLOAT", "(default: FIRST's, 0.1651)")] = None
     """Side of the black square of every tag in a WPILib layout, which does not tell."""
     family: Annotated[
         WPILibFamily | None, optional("{tag16h5,tag25h9,tag36h11}", "(default: FIRST's, tag36h11)")
     ] = None
     """Of the tags in a WPILib layout, which does not tell."""
     field_size_m: Annotated[
-        tuple[float, float] | None,
-        optional("LENGTH WIDTH", "(default: what the map spans)"),
-        POSITIVE,
+        tuple[Positive, Positive] | None, optional("LENGTH WIDTH", "(default: what the map spans)")
     ] = None
     """Of the field in a WPILib layout to be written."""
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         for name in ("yaw_deg", "elevation_deg", "roll_deg"):
             placed = self.position_m is not None or getattr(self, name) == 0
             require(placed, flag_of(name), "needs --position-m")
@@ -260,12 +253,12 @@ class CalibrateConvert(Checked):
 
 
 @dataclass(frozen=True)
-class _Seen(Checked):
+class _Seen:
     """What those are told that find places by what the cameras saw."""
 
     recordings: Recordings
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         require(len(self.recordings) > 0, "RECORDING", "missing: what has the rig seen?")
 
 
@@ -360,7 +353,7 @@ class CalibrateCompare:
 
 
 @dataclass(frozen=True)
-class CalibrateOdometry(Headless):
+class CalibrateOdometry:
     """Find the scale of the speed, the steering's gain and offset, wheelbase and cameras' delay.
 
     From drives past markers whose places are known: eights in front of one, at full lock and half,
@@ -386,11 +379,12 @@ class CalibrateOdometry(Headless):
     """Who finds the markers in a ROS bag's images."""
     fix: Annotated[tuple[OdometryParameter, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """What is not looked for: it stays as it is in --vehicle."""
-    wheelbase_sigma_m: Annotated[float | None, optional("M"), within("size_m")] = None
+    wheelbase_sigma_m: Annotated[SizeM | None, optional("M")] = None
     """How well the wheelbase in --vehicle was measured; by default nothing is known of it."""
     out: ResultsFolder = Path("calibrated")
+    headless: Headless = False
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         require(bool(self.recordings), "RECORDING", "names no recording")
         if self.wheelbase_sigma_m is not None:
             problem = "goes with a wheelbase that is looked for: leave it out of --fix"

@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
-    Checked,
     KeyValues,
     OptionalFile,
     OptionalName,
@@ -21,7 +20,7 @@ from jaxnav.commands.kinds import (
 
 
 @dataclass(frozen=True)
-class Doctor(Checked):
+class Doctor:
     """Check what a car will run with, and say what to do about each finding.
 
     Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that
@@ -49,6 +48,6 @@ class Doctor(Checked):
     json: OptionalFile = None
     """Write all findings into this file too."""
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         key_values("--option", self.option)
         key_values("--frame", self.frame, "CAMERA=IMAGE")

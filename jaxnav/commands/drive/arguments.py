@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Gt, Interval
 
 from jaxnav.commands.kinds import (
-    AT_LEAST_1,
-    POSITIVE,
     Believed,
-    Checked,
     CornerBackend,
+    CornerSigma,
+    Count,
     Detector,
     Float64,
     Following,
@@ -19,6 +19,7 @@ from jaxnav.commands.kinds import (
     KeyValues,
     OptionalFile,
     OptionalName,
+    Positive,
     QCarFile,
     QCarMarkers,
     QCarRig,
@@ -26,28 +27,29 @@ from jaxnav.commands.kinds import (
     ResultsFolder,
     Seed,
     Selector,
+    SizeM,
     Switch,
-    flag_of,
     optional,
     require,
-    within,
 )
 
-
-def check_times(args: "Run | Ros") -> None:
-    """Refuse a period or a timeout that no loop can keep.
-
-    Raises:
-        BadInput: names the flag.
-    """
-    for name, least, most in (("period_s", 0.002, 0.1), ("timeout_s", 0.1, 10)):
-        value = getattr(args, name)
-        bounds = f"must be from {least} to {most}, got {value}"
-        require(least <= value <= most, flag_of(name), bounds)
+# What a loop can keep.
+_Period = Annotated[
+    float,
+    Interval(ge=0.002, le=0.1),
+    tyro.conf.arg(help="Between two readings of the odometer, s."),
+]
+_Timeout = Annotated[
+    float,
+    Interval(ge=0.1, le=10),
+    tyro.conf.arg(
+        help="So long after the last sign of life of any thread the vehicle has been stopped, s."
+    ),
+]
 
 
 @dataclass(frozen=True)
-class Run(Checked):
+class Run:
     """Drive a vehicle through its route.
 
     The vehicle is what its file says: a car, or a base that is driven by a twist. Everything is
@@ -89,28 +91,25 @@ class Run(Checked):
     """Record the cameras' images too, as JPEG."""
     view: Switch = False
     """Open Rerun and look on. Needs the extra viz."""
-    duration_s: Annotated[
-        float | None, optional("S", "(default: until the last waypoint)"), POSITIVE
-    ] = None
+    duration_s: Annotated[Positive | None, optional("S", "(default: until the last waypoint)")] = (
+        None
+    )
     """End after this time, s."""
-    period_s: float = 0.02
-    """Between two readings of the odometer, s."""
-    timeout_s: float = 0.2
-    """So long after the last sign of life of any thread the vehicle has been stopped, s."""
+    period_s: _Period = 0.02
+    timeout_s: _Timeout = 0.2
     float64: Float64 = False
     seed: Seed = 0
     """Of a simulated vehicle."""
     headless: Switch = False
     """No status line."""
 
-    def _check(self) -> None:
-        check_times(self)
+    def __post_init__(self) -> None:
         recorded = self.record is not None or not self.record_images
         require(recorded, "--record-images", "needs --record")
 
 
 @dataclass(frozen=True)
-class Stop(Checked):
+class Stop:
     """Tell a vehicle to stop that nobody drives any more.
 
     For a service manager (`ExecStopPost`), after both processes of `jaxnav run` were killed at
@@ -127,7 +126,7 @@ class Stop(Checked):
 
 
 @dataclass(frozen=True)
-class Ros(Checked):
+class Ros:
     """Localise and drive as a lifecycle node of ROS 2, named jaxnav.
 
     FILE says which topic is what and names our files. With a route the node drives a car or another
@@ -147,24 +146,19 @@ class Ros(Checked):
     bag: OptionalFile = None
     """Take the messages of this bag of ROS 1 or 2, as `jaxnav replay` does, and send what comes of
     them and /clock; no vehicle hears a command."""
-    rate: Annotated[float, POSITIVE] = 1.0
+    rate: Annotated[float, Gt(0)] = 1.0
     """How fast the bag is played, times real time; inf is as fast as it goes."""
     corner_backend: Detector = "aruco"
     detector: Following = "follow"
-    period_s: float = 0.02
-    """Between two readings of the odometer, s."""
-    timeout_s: float = 0.2
-    """So long after the last sign of life of any thread the vehicle has been stopped, s."""
+    period_s: _Period = 0.02
+    timeout_s: _Timeout = 0.2
     float64: Float64 = False
     ros_args: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WORDS")] = ()
     """Words for ROS itself, last on the line: --ros-args -p use_sim_time:=true."""
 
-    def _check(self) -> None:
-        check_times(self)
-
 
 @dataclass(frozen=True)
-class Faults(Headless):
+class Faults:
     """Drive the simulated vehicle with every fault of the fault matrix, and print what came of it.
 
     Cameras, stamps, odometry, actuators, calibration, the world and the loop fail in some ninety
@@ -180,10 +174,11 @@ class Faults(Headless):
     json: OptionalFile = None
     """Write the table into this file too."""
     float64: Float64 = False
+    headless: Headless = False
 
 
 @dataclass(frozen=True)
-class ReplayRecording(Headless):
+class ReplayRecording:
     """Drive a recorded drive again, or localise a recorded camera rig in every frame.
 
     A drive is a .mcap of `jaxnav`, or a ROS bag with --topics, --rig, --markers, --vehicle and
@@ -226,7 +221,7 @@ class ReplayRecording(Headless):
     ] = None
     """Which of the two poses of a marker is believed."""
     corner_sigma_px: Annotated[
-        float | None, optional("PX", "(default: as the recording tells)"), within("corner_sigma_px")
+        CornerSigma | None, optional("PX", "(default: as the recording tells)")
     ] = None
     """Standard deviation of a corner coordinate."""
     without_odometry: Switch = False
@@ -234,13 +229,14 @@ class ReplayRecording(Headless):
     smooth: Switch = False
     """Tell each pose what was seen after it as well as before, both branches weighed over all of
     it; the trajectory goes on where no marker is seen. Of a drive it is smoothed.tum."""
-    limit: Annotated[int | None, optional("N", "(default: all)", int), AT_LEAST_1] = None
+    limit: Annotated[Count | None, optional("N", "(default: all)", int)] = None
     """Stop after N frames, of a drive after N inputs."""
     out: ResultsFolder = Path("out")
+    headless: Headless = False
 
 
 @dataclass(frozen=True)
-class ViewDrive(Headless):
+class ViewDrive:
     """Look at a recorded drive in Rerun: map, cameras, candidates, health, over time.
 
     Opens a window, or writes an .rrd file to --out. Needs the extra `viz`.
@@ -250,10 +246,11 @@ class ViewDrive(Headless):
     """Recorded drive (.mcap)."""
     out: OptionalFile = None
     """Write this file (.rrd) instead of opening a window."""
+    headless: Headless = False
 
 
 @dataclass(frozen=True)
-class Locate(Checked):
+class Locate:
     """Find markers in a photograph and print both poses of each.
 
     With each marker: reprojection errors, their ratio, the probability that the better pose is
@@ -265,7 +262,7 @@ class Locate(Checked):
     """Photograph, in any format that OpenCV reads, or HEIC; not turned by its EXIF orientation."""
     camera: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
-    marker_size_m: Annotated[float, tyro.conf.arg(metavar="S"), within("size_m")]
+    marker_size_m: Annotated[SizeM, tyro.conf.arg(metavar="S")]
     """Side of the black square, m."""
     camera_name: OptionalName = None
     """Which camera of the file took it, where the file holds several."""

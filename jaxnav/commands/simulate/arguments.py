@@ -5,14 +5,15 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 
 from jaxnav.commands.kinds import (
+    CornerSigma,
     Count,
     Detector,
     Following,
     Headless,
     NotNegative,
-    NotNegativeCount,
     OptionalFile,
     Positive,
     QCarFile,
@@ -27,12 +28,11 @@ from jaxnav.commands.kinds import (
     Switch,
     optional,
     require,
-    within,
 )
 
 
 @dataclass(frozen=True)
-class Demo(Headless):
+class Demo:
     """Drive through the paper's waypoints: a simulated car, four rendered cameras, one marker.
 
     Each seed is driven twice from the same start: by our method, and by what people use otherwise
@@ -68,6 +68,7 @@ class Demo(Headless):
     detector: Following = "follow"
     duration_s: Positive = 30.0
     """Give up when the car has not arrived after this simulated time, s."""
+    headless: Headless = False
 
 
 @dataclass(frozen=True)
@@ -84,16 +85,14 @@ class Simulate(ScenarioCarFiles):
 
     scenario: Scenario = "paper"
     """What happens: the paper's drive, or one with trouble in it."""
-    laps: NotNegativeCount = 0
+    laps: Annotated[int, Interval(ge=0, le=100)] = 0
     """Drive this many laps before the marker, 6 m and 18 s each, instead of the scenario's
     own route, for errors that repeat: `paper` is then the clean drive to compare with."""
     selector: tuple[SimulatedSelector, ...] = ("multi-hypothesis",)
     """Which pose is believed; several names, or `all`."""
-    corner_noise_px: Annotated[tuple[float, ...], within("corner_sigma_px")] = (1.0,)
+    corner_noise_px: tuple[CornerSigma, ...] = (1.0,)
     """Standard deviation of the corners, one or several."""
-    told_noise_px: Annotated[
-        float | None, optional("PX", "(default: the truth)"), within("corner_sigma_px")
-    ] = None
+    told_noise_px: Annotated[CornerSigma | None, optional("PX", "(default: the truth)")] = None
     """What the navigator is told of it."""
     seeds: Count = 100
     """How many drives."""
@@ -106,10 +105,9 @@ class Simulate(ScenarioCarFiles):
     resume: Switch = False
     """Keep the rows that --json holds already."""
 
-    def _check(self) -> None:
-        super()._check()
+    def __post_init__(self) -> None:
+        super().__post_init__()
         require(not self.laps or self.route is None, "--laps", "takes the place of --route")
-        require(self.laps <= 100, "--laps", f"must be at most 100, got {self.laps}")
         require(bool(self.selector), "--selector", "names no selector")
         require(bool(self.corner_noise_px), "--corner-noise-px", "holds no number")
         require(not self.resume or self.json is not None, "--resume", "needs --json")

@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from jaxnav.commands.kinds import (
-    AT_LEAST_1,
     Count,
     Headless,
     ResultsFolder,
@@ -20,7 +19,7 @@ from jaxnav.commands.kinds import (
 
 
 @dataclass(frozen=True)
-class RunStudy(Headless):
+class RunStudy:
     """Run a Monte-Carlo study: a labelled grid of parameters, many trials in every cell.
 
     `ambiguity` studies single frames, `drive` closed-loop drives. CONFIG is a YAML file, or the
@@ -35,22 +34,23 @@ class RunStudy(Headless):
     """YAML file with `trials`, `axes` and what is fixed; or a name; or `list`."""
     out: Annotated[Path | None, optional("STORE", "(default: out/CONFIG.zarr)")] = None
     """Where the result goes, or goes on."""
-    workers: Annotated[int | None, optional("N", "(default: this process)", int), AT_LEAST_1] = None
+    workers: Annotated[Count | None, optional("N", "(default: this process)", int)] = None
     """Start so many Dask workers on this machine."""
     scheduler: Annotated[str | None, optional("ADDRESS", constructor=str)] = None
     """Run on the Dask cluster with its scheduler there, e.g. tcp://127.0.0.1:8786."""
-    chunk_trials: Annotated[
-        int | None, optional("N", "(default: 65536, or 256 drives)", int), AT_LEAST_1
-    ] = None
+    chunk_trials: Annotated[Count | None, optional("N", "(default: 65536, or 256 drives)", int)] = (
+        None
+    )
     """How many trials are run and written at a time. Changes no result."""
+    headless: Headless = False
 
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         own = self.workers is None or self.scheduler is None
         require(own, "--scheduler", "brings its own workers")
 
 
 @dataclass(frozen=True)
-class Plot(Headless):
+class Plot:
     """Draw a study or a recorded drive.
 
     Of a study: flip-rate maps, curves with their intervals, reliability diagrams, and summary.json
@@ -62,10 +62,11 @@ class Plot(Headless):
     """What `jaxnav study` wrote, or a recorded drive (.mcap)."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
     """Folder for the pictures."""
+    headless: Headless = False
 
 
 @dataclass(frozen=True)
-class StudyReliability(Headless):
+class StudyReliability:
     """Draw whether flip probabilities mean what they say: when it says 10 %, are 10 % flipped?
 
     Without RECORDING, on random views of one marker (sides of 10 to 100 px, 0 to 60 degrees, corner
@@ -82,3 +83,4 @@ class StudyReliability(Headless):
     seed: Seed = 0
     """Of the random views."""
     out: ResultsFolder = Path("out")
+    headless: Headless = False

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Interval
 
 from jaxnav.commands.kinds import (
     Believed,
@@ -57,7 +58,7 @@ class TuneFilter(ScenarioCarFiles):
     """Simulated drives that decide when to stop."""
     test_seeds: Count = 200
     """Simulated drives for the report."""
-    seed: int = 0
+    seed: Annotated[int, Interval(ge=0, lt=10**6)] = 0
     """The first seed; test drives count from a million on."""
     loss: Literal["likelihood", "score", "error"] = "likelihood"
     """Likelihood of the corners, which asks no truth; density of the true pose under what is
@@ -74,8 +75,8 @@ class TuneFilter(ScenarioCarFiles):
     """At most so many evaluations."""
     out: ResultsFolder = Path("tuned")
 
-    def _check(self) -> None:
-        super()._check()
+    def __post_init__(self) -> None:
+        super().__post_init__()
         for flag, plain in (
             ("--base", self.base == "ackermann"),
             ("--imu", self.imu == "none"),
@@ -83,7 +84,6 @@ class TuneFilter(ScenarioCarFiles):
         ):
             alone = plain or not self.recordings
             require(alone, flag, "is of simulated drives: recordings tell what drove")
-        require(0 <= self.seed < 10**6, "--seed", f"must be from 0 to 999999, got {self.seed}")
         most = 10**6 - self.seed - self.seeds
         require(self.held_out_seeds <= most, "--seeds", "test drives count from a million on")
         begin, end = self.part
@@ -140,8 +140,8 @@ class TuneController(ScenarioCarFiles):
     """Of Adam, at the first step; a tenth of it at the last."""
     out: ResultsFolder = Path("tuned")
 
-    def _check(self) -> None:
-        super()._check()
+    def __post_init__(self) -> None:
+        super().__post_init__()
         require(bool(self.test_scenario), "--test-scenario", "names no scenario")
         total = self.time + self.cross_track + self.effort + self.smoothness
         require(total > 0, "--time", "is 0 as all other weights are: there is nothing to lower")

@@ -16,6 +16,7 @@ from jaxnav.calibrate.lens.images import calibrate_images
 from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import write_board
+from jaxnav.commands.kinds import check_values
 from jaxnav.core.models.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
@@ -222,4 +223,4 @@ def test_sources_are_told_apart_by_camera(tmp_path) -> None:
 )
 def test_what_can_not_be_asked(tmp_path, sources, more, line) -> None:
     with pytest.raises(BadInput, match=f"^{line}"):
-        arguments(tmp_path, tmp_path, *sources, **more)
+        check_values(arguments(tmp_path, tmp_path, *sources, **more))

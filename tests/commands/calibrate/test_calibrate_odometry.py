@@ -140,7 +140,7 @@ def test_a_marker_that_is_elsewhere_is_not_blamed_on_the_odometry(capsys, tmp_pa
         ((), "RECORDING"),
         (("nowhere.mcap",), "nowhere.mcap: there is no such recording"),
         (("tests",), "is no recording of jaxnav (.mcap): a ROS bag needs --topics"),
-        (("a.mcap", "--wheelbase-sigma-m", "0"), "--wheelbase-sigma-m: must be positive"),
+        (("a.mcap", "--wheelbase-sigma-m", "0"), "--wheelbase-sigma-m: must be from 0.001"),
         (("a.mcap", "--fix", "wheelbase_m", "--wheelbase-sigma-m", "0.001"), "leave it out of"),
         (("a.mcap", "--fix", "speed"), "--fix"),
     ],

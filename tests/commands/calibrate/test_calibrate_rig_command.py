@@ -232,9 +232,9 @@ def test_all_sizes_ten_times_too_large_are_refused(drive, tmp_path, capsys, room
         (["rig", "nothing.mcap"], "nothing.mcap: there is no such file"),
         (["rig", "DRIVE", "--vehicle-frame", "roof"], "--vehicle-frame: must be one of places, "),
         (["rig", "DRIVE", "--family", "tag99"], "--family: unknown 'tag99'"),
-        (["rig", "DRIVE", "--marker-size-m", "0"], "--marker-size-m: must be positive"),
+        (["rig", "DRIVE", "--marker-size-m", "0"], "--marker-size-m: must be from 0.001"),
         (["check", "DRIVE"], "one marker of the map was seen, two at least must be"),
-        (["check", "DRIVE", "--tolerance-m", "-1"], "--tolerance-m: must be positive"),
+        (["check", "DRIVE", "--tolerance-m", "-1"], "--tolerance-m: must be greater than 0"),
     ],
 )
 def test_bad_input_gets_one_line(drive, tmp_path, capsys, words, problem):

@@ -9,6 +9,7 @@ import yaml
 
 from jaxnav import cli, files
 from jaxnav.commands.calibrate.arguments import CalibrateConvert
+from jaxnav.commands.kinds import check_values
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files.figures import CameraFigures
@@ -99,14 +100,17 @@ def test_a_flag_that_does_not_fit_is_one_line(tmp_path, source, to, out, flags, 
     ("flags", "expected"),
     [
         ({"yaw_deg": 3.0}, "--yaw-deg: needs --position-m"),
-        ({"roll_deg": float("nan")}, "--roll-deg: must be from -3600 to 3600 deg, got"),
-        ({"field_size_m": (1.0, 0.0)}, "--field-size-m: must be positive and finite, got 0.0"),
-        ({"marker_size_m": -1.0}, "--marker-size-m: must be positive and finite, got -1.0"),
+        (
+            {"position_m": (0.0, 0.0, 0.0), "roll_deg": float("nan")},
+            "--roll-deg: must be from -3600 to 3600 deg, got",
+        ),
+        ({"field_size_m": (1.0, 0.0)}, "--field-size-m: must be greater than 0, got 0.0"),
+        ({"marker_size_m": -1.0}, "--marker-size-m: must be from 0.001 to 100 m, got -1"),
     ],
 )
 def test_a_value_that_cannot_be_is_one_line(flags, expected):
     with pytest.raises(BadInput, match=expected.replace("(", "\\(")):
-        CalibrateConvert(Path("a"), "ros", Path("b"), **flags)
+        check_values(CalibrateConvert(Path("a"), "ros", Path("b"), **flags))
 
 
 def test_a_camera_without_a_place_goes_into_no_rig(tmp_path):
