@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from jaxnav.calibrate.board.images import source_files
 from jaxnav.cli import main, nothing_hidden
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.report import save_figure
 from jaxnav.errors import BadInput, Containment, visible
 from jaxnav.files.images import decode_image
 from jaxnav.vehicles.opencv_cameras import _device

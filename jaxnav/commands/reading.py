@@ -5,13 +5,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from jaxnav.commands.bars import progress_bar
+from jaxnav.commands.bars import FROM_S, progress_bar
 from jaxnav.commands.kinds import flag_of
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
 from jaxnav.recordings.drive_log import DriveLog, read_drive
 
-_PATIENCE_S = 2.0
 _LOADS = {
     "rig": load_rig, "markers": load_markers, "vehicle": load_vehicle, "route": load_route,
 }  # fmt: skip
@@ -39,12 +38,12 @@ def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dic
 
 
 def read_shown(path: Path, headless: bool = False) -> DriveLog:
-    """`read_drive`, with a bar where it takes longer than `_PATIENCE_S`."""
+    """`read_drive`, with a bar where it takes longer than `FROM_S`."""
     size = None
     with suppress(OSError, ValueError):  # the reader says what is wrong
         size = path.stat().st_size
     with progress_bar(
-        total=size, unit="B", unit_scale=True, desc="reading", leave=False, delay=_PATIENCE_S,
+        total=size, unit="B", unit_scale=True, desc="reading", leave=False, delay=FROM_S,
         disable=headless,
     ) as bar:  # fmt: skip
         return read_drive(path, bar.update)

@@ -56,7 +56,7 @@ KEYS = [
 
 @pytest.mark.parametrize("value", [1e308, -1e12])
 def test_a_picture_is_drawn_whatever_was_reported(value, parts, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("jaxnav.commands.pictures.PNG_DPI", 20)
+    monkeypatch.setattr("jaxnav.commands.report.PNG_DPI", 20)
     changed = []
     for index, (topic, message) in enumerate(parts):
         row, key = dict(message), KEYS[index % len(KEYS)]

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from jaxnav.commands.calibrate.arguments import CalibrateAdopt
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
+from jaxnav.commands.report import save_figure
 from jaxnav.core.models.vehicle import SENSOR_ERRORS
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json

@@ -11,8 +11,8 @@ from jaxnav.calibrate.rig.vehicle_frame import moved_world
 from jaxnav.commands.calibrate.arguments import CalibrateCheck as Arguments
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import provenance, summary, write_files
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import save_figure
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.pictures.rig import map_check

@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxnav.calibrate.lens.maps import ImageMap, projection_difference
 from jaxnav.commands.calibrate.arguments import CalibrateCompare
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import save_figure
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder, write_json
 from jaxnav.files.cameras import camera_file

@@ -15,8 +15,8 @@ from jaxnav.calibrate.lens.intrinsics import LensCalibration
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import save_figure
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder, write_json

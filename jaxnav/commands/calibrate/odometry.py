@@ -13,8 +13,8 @@ from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
-from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import corners_in_world, save_figure
 from jaxnav.core.models.origin import planar_in_world
 from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.errors import visible

@@ -19,8 +19,8 @@ from jaxnav.commands.calibrate.report import (
     text,
     write_files,
 )
-from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import corners_in_world, save_figure
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import calib_dir, load_car, output_folder, write_json
 from jaxnav.pictures.rig import rig_report

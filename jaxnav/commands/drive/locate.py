@@ -13,8 +13,8 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Locate
 from jaxnav.commands.drive.locate_notes import notes
-from jaxnav.commands.pictures import normals_px, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import normals_px, save_figure
 from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.models.camera import Camera

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.reading import read_shown
+from jaxnav.commands.report import save_figure
 from jaxnav.commands.study.arguments import Plot as Arguments
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.interfaces import Odometry, Reading

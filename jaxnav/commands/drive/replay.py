@@ -10,8 +10,8 @@ from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive import replay_drive
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
-from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import corners_in_world, save_figure
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible

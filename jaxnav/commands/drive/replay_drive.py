@@ -15,9 +15,9 @@ from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive import replay_smoothed
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import flag_of
-from jaxnav.commands.pictures import corners_in_world, save_figure
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
+from jaxnav.commands.report import corners_in_world, save_figure
 from jaxnav.drive.flags import Fault, Health, Reject, names
 from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import BadInput, visible

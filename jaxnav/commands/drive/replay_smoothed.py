@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
-from jaxnav.commands.pictures import corners_in_world, save_figure
+from jaxnav.commands.report import corners_in_world, save_figure
 from jaxnav.files import write_tum
 from jaxnav.pictures.localisation import localisation_report
 from jaxnav.recordings.drive_events import DriveEvents

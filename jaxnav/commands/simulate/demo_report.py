@@ -8,7 +8,7 @@ import jaxlie
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxnav.commands.pictures import corners_in_world, normals_px, save_figure
+from jaxnav.commands.report import corners_in_world, normals_px, save_figure
 from jaxnav.commands.simulate.demo_drives import LABELS, OURS, Drives, Record
 from jaxnav.commands.simulate.demo_scores import RATES, lines
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar

@@ -7,7 +7,7 @@ from typing import Any
 import xarray as xr
 
 from jaxnav.commands.bars import progress_bar
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.report import save_figure
 from jaxnav.commands.study.arguments import Plot as Arguments
 from jaxnav.commands.study.studies import summary_of
 from jaxnav.errors import BadInput, visible

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from jaxnav.commands.bars import progress_bar
-from jaxnav.commands.pictures import save_figure
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import save_figure
 from jaxnav.commands.study.arguments import StudyReliability as Arguments
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.errors import BadInput, visible

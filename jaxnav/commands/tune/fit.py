@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from matplotlib.figure import Figure
 
 from jaxnav.commands.bars import progress_bar
-from jaxnav.commands.pictures import save_figure
+from jaxnav.commands.report import save_figure
 from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.experiments.tuning.unconstrained import Space

@@ -1,30 +1,52 @@
-"""Drawing for the commands: normals of markers in images, and figures into files."""
+"""What a command hands over: figures and numbers in files, and lines on the terminal."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Float
-from matplotlib.artist import Artist
-from matplotlib.axis import Axis, Tick
-from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import points_in_world
 from jaxnav.errors import visible
-from jaxnav.files import atomic_path
+from jaxnav.files import atomic_path, write_json
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 PNG_DPI = 110
 _NORMAL_SIDES = 0.8  # length of a drawn normal, in sides of the marker
 
 
-def save_figure(figure: Figure, path: Path, dpi: float = PNG_DPI) -> None:
+def write_report(
+    folder: Path,
+    summary: dict[str, Any],
+    lines: Iterable[str] = (),
+    name: str = "summary.json",
+    **figures: "Figure",
+) -> None:
+    """Write the results of a command into a folder, and print what they say.
+
+    Args:
+        name: of the file of the numbers.
+        figures: pictures, by their names without `.png`.
+    """
+    write_json(folder / name, summary)
+    for picture, figure in figures.items():
+        save_figure(figure, folder / f"{picture}.png")
+    for line in lines:
+        print(line, flush=True)
+
+
+def save_figure(figure: "Figure", path: Path, dpi: float = PNG_DPI) -> None:
     """Write a figure, as JPEG where the file's name ends so, else as PNG; whole or not at all."""
     for text in _words(figure):
         # Names of files and markers are no formulas, and may hold any characters.
@@ -36,8 +58,11 @@ def save_figure(figure: Figure, path: Path, dpi: float = PNG_DPI) -> None:
         figure.savefig(beside, dpi=dpi, format=form)
 
 
-def _words(artist: Artist) -> Iterator[Text]:
+def _words(artist: "Artist") -> Iterator["Text"]:
     """All texts of a figure except at its ticks, which are numbers and formulas of powers."""
+    from matplotlib.axis import Axis, Tick  # whoever has a figure has loaded it
+    from matplotlib.text import Text
+
     for child in artist.get_children():
         if isinstance(child, Text):
             yield child
