@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxnav
 from jaxnav.commands.simulate.arguments import Demo
-from jaxnav.commands.simulate.demo_drives import OPENCV, START_SPREAD, Method, make_methods
+from jaxnav.commands.simulate.demo import OPENCV, START_SPREAD, Method, make_methods
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld
 from jaxnav.core.models.geometry import wrap_angle_np
 from jaxnav.core.pose.observation import Observation

@@ -78,10 +78,10 @@ def corners_in_world(markers: MarkerMap) -> Float[np.ndarray, "M 4 3"]:
 
 
 def normals_px(
-    camera: Camera, Ts_camera_marker: jaxlie.SE3, sizes_m: Float[np.ndarray | jax.Array, " N"]
+    camera: Camera, Ts_camera_marker: jaxlie.SE3, sizes_m: Float[np.ndarray | jax.Array, " #N"]
 ) -> Float[np.ndarray, "N 2 2"]:
     """The normals of N markers in an image, (N, 2, 2): foot and tip, x y, px."""
-    length_m = _NORMAL_SIDES * jnp.asarray(sizes_m)
+    length_m = _NORMAL_SIDES * jnp.asarray(sizes_m)[..., None]
     foot = Ts_camera_marker.translation()
-    tip = foot + length_m[:, None] * Ts_camera_marker.rotation().as_matrix()[:, :, 2]
+    tip = foot + length_m * Ts_camera_marker.rotation().as_matrix()[:, :, 2]
     return np.asarray(camera.project(jnp.stack([foot, tip], axis=1)))

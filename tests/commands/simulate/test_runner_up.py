@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from jaxlie import SE3, SO3
 
-from jaxnav.commands.simulate.runner_up import SELECTOR, SIGMA_PX, OpenCVDetector
+from jaxnav.commands.simulate.demo import OPENCV_SELECTOR, OPENCV_SIGMA_PX, OpenCVDetector
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
@@ -37,7 +37,7 @@ def test_corners_are_opencv_s_in_our_order_with_the_told_sigma():
     assert found.families == ("tag36h11",)
     expected = 60 + 24 * (1 + CORNER_SIGNS[:, :2] * [1, -1])
     np.testing.assert_allclose(found.corners_px[0], expected, atol=1.0)
-    np.testing.assert_array_equal(found.sigma_px, np.full((1, 4), SIGMA_PX))
+    np.testing.assert_array_equal(found.sigma_px, np.full((1, 4), OPENCV_SIGMA_PX))
     usual = cv2.aruco.DetectorParameters()
     usual.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     codes = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -82,7 +82,7 @@ def test_the_pose_taken_is_the_first_of_solve_pnp_generic():
         markers=markers,
         vehicle=load_vehicle(QCAR / "vehicle.yaml"),
         waypoints_m=((1.3, 0.0),),
-        selector=make_selector(SELECTOR),
+        selector=make_selector(OPENCV_SELECTOR),
     )
     step, rng = jax.jit(navigator.step), np.random.default_rng(0)
     same = wrong = 0
@@ -92,13 +92,13 @@ def test_the_pose_taken_is_the_first_of_solve_pnp_generic():
         pose = jnp.array([x_m, y_m, np.arctan2(1.47 - y_m, -x_m) + turn_rad])
         T_vehicle_world = T_world_vehicle_from_planar(pose).inverse()
         corners_px = np.asarray(rig.project(T_vehicle_world, markers.corners_world_m)).copy()
-        corners_px[0, 0] += SIGMA_PX * rng.standard_normal((4, 2))
+        corners_px[0, 0] += OPENCV_SIGMA_PX * rng.standard_normal((4, 2))
         visible = jnp.zeros((4, 1), bool).at[0, 0].set(True)
         seen = Observation(
             corners_px=jnp.asarray(corners_px),
             visible=visible,
             dt_s=jnp.asarray(0.0),
-            corner_sigma_px=jnp.full((4, 1, 4), SIGMA_PX),
+            corner_sigma_px=jnp.full((4, 1, 4), OPENCV_SIGMA_PX),
         )
         _, out = step(navigator.init(), seen)
         taken = SE3(out.candidates.T_vehicle_world.wxyz_xyz[out.selected])
