@@ -1,44 +1,19 @@
 """Draw a fit: its losses, its parameters and its results on held-out drives."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxnav.experiments.tuning.fit import TuningFit
+from jaxnav.experiments.tuning.fit import ControllerScores, EstimatorScores, TuningFit
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 
 _COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
 _LINES = ("-", "--", ":")
-
-
-@dataclass(frozen=True)
-class EstimatorScores:
-    """The scores of an estimator on drives that had no part in the fit."""
-
-    rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
-    anees: tuple[float, float, float]
-    band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
-    error_m: Float[np.ndarray, " N"]  # of every judged frame
-    indefinite: int  # judged frames whose covariance is indefinite by rounding; not in ANEES
-
-
-@dataclass(frozen=True)
-class ControllerScores:
-    """The results of a controller in one scenario, on seeds never trained on."""
-
-    loss: tuple[float, float, float]  # mean with its 95 % interval
-    parts: dict[str, float]
-    time_s: tuple[float, float, float]  # to the last waypoint
-    success: tuple[float, float, float]
-    poses: Float[np.ndarray, "frames 3"]  # of the first drive
-    waypoints_m: Float[np.ndarray, "W 2"]
 
 
 def tuning_report(

@@ -1,4 +1,4 @@
-"""What the commands that study many views, and draw what was found, can be told."""
+"""Arguments of the commands that study many views, and draw what was found."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,11 +6,11 @@ import numpy as np
 
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.report import save_figure
+from jaxnav.commands.report import write_report
 from jaxnav.commands.study.arguments import StudyReliability as Arguments
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.errors import BadInput, visible
-from jaxnav.files import output_folder, write_json
+from jaxnav.files import output_folder
 from jaxnav.pictures.localisation import reliability_diagram
 from jaxnav.recordings.other.recordings import read_recording
 from jaxnav.recordings.other.replay import replay
@@ -41,17 +41,14 @@ def run(args: Arguments) -> int:
         f"{name}: {summary['pairs']} pairs, {summary['flipped_fraction']:.2%} flipped, "
         f"expected calibration error {reliability.expected_calibration_error:.4f}"
     )
-    figure = reliability_diagram(
+    diagram = reliability_diagram(
         reliability.predicted,
         reliability.observed,
         reliability.intervals,
         reliability.counts,
         title=text,
     )
-    save_figure(figure, out / "reliability.png")
-    write_json(out / "summary.json", summary)
-    print(text)
-    print(f"diagram in {visible(out)}")
+    write_report(out, summary, [text, f"diagram in {visible(out)}"], reliability=diagram)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What `jaxnav tune` can be told."""
+"""Arguments of `jaxnav tune`."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,17 @@ from jaxnav.errors import BadInput
 from jaxnav.experiments.tuning.descent import Noisy
 from jaxnav.experiments.tuning.drive_loss import DriveLoss
 from jaxnav.experiments.tuning.driving import ClosedLoop
-from jaxnav.experiments.tuning.fit import Problem, TuningFit
+from jaxnav.experiments.tuning.fit import ControllerScores, Problem, TuningFit
 from jaxnav.experiments.tuning.objective import Batch, NotFinite
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import Params, load_params, output_folder
-from jaxnav.pictures.tuning import ControllerScores, controller_report
 from jaxnav.sim.rollout import Rollout
 from jaxnav.sim.scores import Drives
 from jaxnav.sim.statistics import bootstrap_mean, wilson_interval
 from jaxnav.sim.world import Spread
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _CAR = (
     "controller.proportional_per_m",
@@ -64,7 +66,7 @@ def run(args: Arguments) -> int:
         before=gains.before,
         test=gains.test,
         as_json=_as_json,
-        draw=controller_report,
+        draw=_draw,
         text=_text,
     )
 
@@ -214,6 +216,14 @@ def _keys(first: int, count: int) -> Key[Array, " S"]:
     return keys
 
 
+def _draw(
+    fit: TuningFit, space: Space, judged: Mapping[str, tuple[ControllerScores, ControllerScores]]
+) -> "Figure":
+    from jaxnav.pictures.tuning import controller_report  # matplotlib
+
+    return controller_report(fit, space, judged)
+
+
 def _as_json(tested: ControllerScores) -> dict[str, Any]:
     return {
         "loss": measure(tested.loss),
@@ -223,7 +233,7 @@ def _as_json(tested: ControllerScores) -> dict[str, Any]:
     }
 
 
-def _text(summary: dict[str, Any]) -> str:
+def _text(summary: dict[str, Any]) -> list[str]:
     lines = [f"{summary['steps']} steps: {summary['ended']}"]
     before, after = summary["parameters"]["before"], summary["parameters"]["after"]
     lines += [f"  {name}: {before[name]:.3g} -> {after[name]:.3g}" for name in before]
@@ -237,4 +247,4 @@ def _text(summary: dict[str, Any]) -> str:
             f"{now['time_s']['value']:.2f} s, success {was['success_rate']['value']:.1%} -> "
             f"{now['success_rate']['value']:.1%}"
         )
-    return "\n".join(lines)
+    return lines

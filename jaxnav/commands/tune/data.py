@@ -12,11 +12,11 @@ from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.tune.arguments import TuneFilter as Arguments
-from jaxnav.commands.tune.drives import sequences_of_drive
 from jaxnav.commands.tune.sequences import (
     NamedSequences,
     join_sequences,
     navigator_of,
+    sequences_of_drive,
     sequences_of_recording,
 )
 from jaxnav.core.filter.hypotheses import MultiHypothesis
@@ -149,5 +149,5 @@ def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedS
         None if args.rig is None else load_rig(args.rig),
         None if args.markers is None else load_markers(args.markers),
     )
-    navigator = navigator_of(recording, True, args.selector)
-    return NamedSequences(str(path), navigator, sequences_of_recording(recording, True, part))
+    navigator = navigator_of(recording, args.selector)
+    return NamedSequences(str(path), navigator, sequences_of_recording(recording, part))

@@ -1,7 +1,7 @@
 """`jaxnav tune filter`: learn Q and R from recordings or simulated drives."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -20,13 +20,15 @@ from jaxnav.errors import BadInput
 from jaxnav.experiments.tuning.branches import estimate_sequences
 from jaxnav.experiments.tuning.descent import Smooth
 from jaxnav.experiments.tuning.filter import FilterCost
-from jaxnav.experiments.tuning.fit import Problem, TuningFit
+from jaxnav.experiments.tuning.fit import EstimatorScores, Problem, TuningFit
 from jaxnav.experiments.tuning.objective import Batch, Objective, where_not_finite
 from jaxnav.experiments.tuning.recorded import FrameSequences
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import Params, apply_params, load_params, output_folder
-from jaxnav.pictures.tuning import EstimatorScores, tuning_report
 from jaxnav.sim.statistics import anees_band, bootstrap_mean
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STAGES = 4
 
@@ -50,7 +52,7 @@ def run(args: Arguments) -> int:
         before=space.values(space.start),
         test=lambda fit: _tested(args, data, params, space, fit),
         as_json=_as_json,
-        draw=tuning_report,
+        draw=_draw,
         text=_text,
     )
 
@@ -162,6 +164,14 @@ def _test(
     )
 
 
+def _draw(
+    fit: TuningFit, space: Space, judged: Mapping[str, tuple[EstimatorScores, EstimatorScores]]
+) -> "Figure":
+    from jaxnav.pictures.tuning import tuning_report  # matplotlib
+
+    return tuning_report(fit, space, judged)
+
+
 def _as_json(tested: EstimatorScores) -> dict[str, Any]:
     return {
         "position_median_m": float(np.median(tested.error_m)),
@@ -172,7 +182,7 @@ def _as_json(tested: EstimatorScores) -> dict[str, Any]:
     }
 
 
-def _text(summary: dict[str, Any]) -> str:
+def _text(summary: dict[str, Any]) -> list[str]:
     """The summary in lines: parameters, held-out loss, and the tests before and after."""
     lines = [f"{summary['steps']} steps, {summary['stages']} stages: {summary['ended']}"]
     before, after = summary["parameters"]["before"], summary["parameters"]["after"]
@@ -184,7 +194,7 @@ def _text(summary: dict[str, Any]) -> str:
         low, high = of["after"]["anees_consistent"]
         lines.append(f"{name}, never seen before (ANEES of {low:.2f} to {high:.2f} is honest):")
         lines += [f"  {when}: {_judgement(of[when])}" for when in ("before", "after")]
-    return "\n".join(lines)
+    return lines
 
 
 def _judgement(of: dict[str, Any]) -> str:

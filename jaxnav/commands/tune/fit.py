@@ -10,22 +10,24 @@ import zlib
 from collections.abc import Callable, Collection, Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from matplotlib.figure import Figure
 
 from jaxnav.commands.bars import progress_bar
-from jaxnav.commands.report import save_figure
+from jaxnav.commands.report import write_report
 from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.experiments.tuning.unconstrained import Space
-from jaxnav.files import write_json, write_params
+from jaxnav.files import write_params
 from jaxnav.files.locking import sole_writer
 from jaxnav.files.npz import read_npz
 from jaxnav.files.writing import atomic_write, plain_data
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Scores = TypeVar("Scores")
 
@@ -168,22 +170,15 @@ class Fitting:
         try:
             arrays = dict(read_npz(self.checkpoint))
             key = dict(json.loads(str(arrays.pop("run"))))
+            other = [name for name in self.key | key if self.key.get(name) != key.get(name)]
+            if not other:
+                return fit_of(arrays, like)
         except _DAMAGED as error:
-            raise self._damaged(error) from None
-        for name in self.key | key:
-            if self.key.get(name) != key.get(name):
-                problem = (
-                    f"is of another run, whose {name} is {key.get(name)!r} and not "
-                    f"{self.key.get(name)!r}: choose another --out"
-                )
-                raise BadInput(self.checkpoint, problem)
-        try:
-            return fit_of(arrays, like)
-        except _DAMAGED as error:
-            raise self._damaged(error) from None
-
-    def _damaged(self, error: Exception) -> BadInput:
-        return BadInput(self.checkpoint, f"is damaged ({error}): delete it to begin anew")
+            problem = f"is damaged ({error}): delete it to begin anew"
+            raise BadInput(self.checkpoint, problem) from None
+        name = other[0]
+        problem = f"whose {name} is {key.get(name)!r} and not {self.key.get(name)!r}"
+        raise BadInput(self.checkpoint, f"is of another run, {problem}: choose another --out")
 
 
 def run_fit(
@@ -193,8 +188,8 @@ def run_fit(
     before: Mapping[str, Float[Array, "..."]],
     test: Callable[[TuningFit], Mapping[str, tuple[Scores, Scores]]],
     as_json: Callable[[Scores], dict[str, Any]],
-    draw: Callable[[TuningFit, Space, Mapping[str, tuple[Scores, Scores]]], Figure],
-    text: Callable[[dict[str, Any]], str],
+    draw: Callable[[TuningFit, Space, Mapping[str, tuple[Scores, Scores]]], "Figure"],
+    text: Callable[[dict[str, Any]], list[str]],
 ) -> int:
     """Run a fit and its tests, write summary.json and report.png, and print the summary.
 
@@ -226,8 +221,6 @@ def run_fit(
             for name, (was, now) in results.items()
         },
     }
-    write_json(fitting.folder / "summary.json", summary)
-    save_figure(draw(fit, space, results), fitting.folder / "report.png")
-    print(text(summary))
-    print(f"parameters and report in {folder}")
+    lines = [*text(summary), f"parameters and report in {folder}"]
+    write_report(fitting.folder, summary, lines, report=draw(fit, space, results))
     return 0

@@ -18,12 +18,15 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.errors import BadInput
 from jaxnav.experiments.tuning.recorded import FrameSequences
+from jaxnav.recordings.drive_events import DriveEvents, refused_odometry
+from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.other.recording import Recording
 from jaxnav.recordings.other.replay import estimate_corner_sigma_px
 
 LEAST_SEQUENCES = 4
 GAP_S = 0.5  # a marker that was away for longer appears anew
-IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # wxyz xyz
 
 
 class NamedSequences(NamedTuple):
@@ -34,40 +37,160 @@ class NamedSequences(NamedTuple):
     recorded: FrameSequences
 
 
-def bounds(count: int, part: tuple[float, float]) -> tuple[int, int]:
+def sequences_of_drive(
+    log: DriveLog, setup: DriveSetup, part: tuple[float, float], length: int = 400
+) -> FrameSequences:
+    """Sequences of a drive. The vehicle's true pose is unknown, so that no frame is judged.
+
+    Odometry that the pilot refused on the way is left out.
+
+    Args:
+        setup: its `navigator()` goes with the sequences.
+        part: which of the events, as shares of them: (0, 0.5) is the first half.
+        length: events of a sequence, at most.
+
+    Raises:
+        BadInput: a frame of a camera that the rig does not have, or no marker is in view.
+    """
+    events = DriveEvents.of(log.inputs, setup, log.path, refused_odometry(log))
+    begin, end = _bounds(len(events), part)
+    if not np.any(events.obs.visible[begin:end]):
+        problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"
+        raise BadInput(log.path, problem)
+    indices, used = _side_by_side(_cut(np.arange(begin, end), length))
+    obs: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf[indices]), events.obs)
+    shown = obs.visible & used[..., None, None]
+    of_used = shown, obs.has_odometry & used, jnp.where(used, obs.dt_s, 0).at[:, 0].set(0)
+    obs = eqx.tree_at(lambda o: (o.visible, o.has_odometry, o.dt_s), obs, of_used)
+    return FrameSequences(
+        markers=_maps(setup.markers, np.tile(np.arange(len(setup.markers.ids)), (len(used), 1))),
+        obs=obs,
+        used=jnp.asarray(used),
+        T_world_vehicle_true=jnp.asarray(np.tile(_IDENTITY, (*used.shape, 1)), float),
+        judged=jnp.zeros(used.shape, bool),
+    )
+
+
+def navigator_of(
+    recording: Recording, selector: str, corner_sigma_px: float | None = None
+) -> Navigator:
+    """The navigator that localises the rig of a recording by its `sequences_of_recording`.
+
+    Args:
+        selector: one of `SELECTORS`.
+        corner_sigma_px: by default estimated from the recording itself.
+    """
+    if corner_sigma_px is None:
+        corner_sigma_px = estimate_corner_sigma_px(recording)
+    return Navigator(
+        rig=recording.rig,
+        markers=jax.tree.map(lambda leaf: leaf[0], _maps(recording.markers, np.zeros((1, 1), int))),
+        selector=make_selector(selector),
+        motion=ConstantVelocity(),
+        corner_sigma_px=corner_sigma_px,
+    )
+
+
+def sequences_of_recording(
+    recording: Recording, part: tuple[float, float], length: int = 64, shortest: int = 10
+) -> FrameSequences:
+    """Appearances of the markers of a recording, each as if that marker were the only one.
+
+    An appearance has the frames that show the marker. It ends at a gap of more than `GAP_S`, and is
+    cut in equal pieces where it is too long. Judged is where the reference knows the pose.
+
+    Args:
+        part: which of the frames, as shares of them: (0, 0.5) is the first half.
+        length: frames of a sequence, at most.
+        shortest: sequences of fewer frames are left out.
+
+    Raises:
+        BadInput: there are fewer than `LEAST_SEQUENCES`.
+    """
+    begin, end = _bounds(len(recording), part)
+    markers, pieces = [], []
+    for marker, seen in enumerate(recording.seen[begin:end].T):
+        frames = begin + np.flatnonzero(seen)
+        apart_s = np.diff(recording.stamps_ns[frames]) / 1e9
+        for appearance in np.split(frames, np.flatnonzero(apart_s > GAP_S) + 1):
+            for piece in _cut(appearance, length):
+                if len(piece) >= shortest:
+                    markers.append(marker)
+                    pieces.append(piece)
+    if len(pieces) < LEAST_SEQUENCES:
+        raise BadInput(
+            recording.name,
+            f"{end - begin} of its {len(recording)} frames give {len(pieces)} sequences of "
+            f"{shortest} frames or more of one marker without a gap: at least {LEAST_SEQUENCES} "
+            "are needed",
+        )
+    return _recorded(recording, markers, pieces)
+
+
+def _recorded(
+    recording: Recording, markers: Sequence[int], pieces: Sequence[np.ndarray]
+) -> FrameSequences:
+    """Pieces of a recording as sequences side by side, each with its only marker."""
+    frames, used = _side_by_side(pieces)
+    # Piece by piece, so that all markers but one of a large map are dropped at once.
+    alone = [
+        [lanes[:, :, [marker]] for lanes in recording.lanes(piece)]
+        for piece, marker in zip(frames, markers, strict=True)
+    ]
+    corners_px, visible = (np.stack(rows) for rows in zip(*alone, strict=True))
+    visible = visible & used[:, :, None, None]
+    stamps_ns = recording.stamps_ns[frames]
+    fields = {
+        "corners_px": np.where(visible[..., None, None], corners_px, 0.0),
+        "dt_s": np.diff(stamps_ns, axis=1, prepend=stamps_ns[:, :1]) / 1e9,
+    }
+    if recording.odometry is not None:
+        fields["twist"] = np.array([recording.odometry.twists(piece) for piece in stamps_ns])
+    truth, judged, reference = (
+        np.array(_IDENTITY),
+        np.zeros(frames.shape, bool),
+        recording.reference,
+    )
+    if reference is not None:
+        known = reference.valid[frames]
+        judged = used & known & visible.any(axis=(2, 3))
+        Ts = poses_in_world(reference.T_world_vehicle[frames], opposite(recording.markers.origin_m))
+        truth = np.where(known[..., None], Ts, truth)
+    observed: Any = jax.vmap(jax.vmap(lambda fields: Observation(**fields)))
+    return FrameSequences(
+        markers=_maps(recording.markers, np.array(markers)[:, None]),
+        obs=observed(
+            {name: jnp.asarray(value, float) for name, value in fields.items()}
+            | {"visible": jnp.asarray(visible), "has_odometry": jnp.zeros(frames.shape, bool)}
+        ),
+        used=jnp.asarray(used),
+        T_world_vehicle_true=jnp.broadcast_to(jnp.asarray(truth, float), (*frames.shape, 7)),
+        judged=jnp.asarray(judged),
+    )
+
+
+def _bounds(count: int, part: tuple[float, float]) -> tuple[int, int]:
     """The first row and the end of a part of `count` rows; adjoining parts share no row."""
     begin, end = (round(share * count) for share in part)
     return begin, end
 
 
-def cut(indices: Int[np.ndarray, " N"], length: int) -> list[Int[np.ndarray, " T"]]:
+def _cut(indices: Int[np.ndarray, " N"], length: int) -> list[Int[np.ndarray, " T"]]:
     """The fewest pieces of at most `length` indices, whose lengths differ by one at most."""
-    if not len(indices):
-        return []
-    return np.array_split(indices, -(-len(indices) // length))
+    return np.array_split(indices, max(1, -(-len(indices) // length)))
 
 
-def runs(
-    indices: Int[np.ndarray, " N"], stamps_ns: Int[np.ndarray, " F"], gap_s: float
-) -> list[Int[np.ndarray, " T"]]:
-    """Rising indices, split where the stamps of two neighbours are more than `gap_s` apart."""
-    if not len(indices):
-        return []
-    apart_s = np.diff(stamps_ns[indices]) / 1e9
-    return np.split(indices, np.flatnonzero(apart_s > gap_s) + 1)
-
-
-def side_by_side(
+def _side_by_side(
     pieces: Sequence[Int[np.ndarray, " N"]],
 ) -> tuple[Int[np.ndarray, "B T"], Bool[np.ndarray, "B T"]]:
     """Pieces padded to the longest with their last index, and a mask that is False at padding."""
-    length = max(len(piece) for piece in pieces)
-    indices = np.array([np.pad(piece, (0, length - len(piece)), mode="edge") for piece in pieces])
     lengths = np.array([len(piece) for piece in pieces])
-    return indices, np.arange(length) < lengths[:, None]
+    longest = int(lengths.max())
+    indices = [np.pad(piece, (0, longest - len(piece)), mode="edge") for piece in pieces]
+    return np.array(indices), np.arange(longest) < lengths[:, None]
 
 
-def maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
+def _maps(markers: MarkerMap, rows: Int[np.ndarray, "B N"]) -> MarkerMap:
     """A map for each of B sequences, of N markers; ids are dummies, which no estimate uses."""
 
     def some(wxyz_xyz: Float[Array, "N 7"], size_m: Float[Array, " N"]) -> MarkerMap:
@@ -97,8 +220,8 @@ def _apart(one: NamedSequences, other: NamedSequences) -> str | None:
     for what, here, there in zip(("cameras", "markers"), lanes, lanes_other, strict=True):
         if here != there:
             return f"must have as many {what} to be tuned on together, got {here} and {there}"
-    told = [named.recorded.obs.twist is not None for named in (one, other)]
-    if told[0] != told[1]:
+    with_twist = [named.recorded.obs.twist is not None for named in (one, other)]
+    if with_twist[0] != with_twist[1]:
         return "must both have odometry, or neither, to be tuned on together"
     if not _alike(one.recorded, other.recorded):
         return "must be of one kind to be tuned on together, drives or recordings of a rig"
@@ -123,128 +246,3 @@ def _vehicle(navigator: Navigator) -> Any:
 def _alike(one: Any, other: Any) -> bool:
     """Whether two trees have the same structure, whatever their leaves hold."""
     return bool(eqx.tree_equal(*(jax.tree.map(lambda _: 0, tree) for tree in (one, other))))
-
-
-def observations(**fields: jax.Array) -> Observation:
-    """Observations (B, T) of their fields, (B, T, ...) each."""
-    of: Any = jax.vmap(jax.vmap(lambda fields: Observation(**fields)))
-    stacked: Observation = of(fields)
-    return stacked
-
-
-def navigator_of(
-    recording: Recording,
-    one_at_a_time: bool,
-    selector: str,
-    corner_sigma_px: float | None = None,
-) -> Navigator:
-    """The navigator that localises the rig of a recording by its `sequences_of_recording`.
-
-    Args:
-        selector: one of `SELECTORS`.
-        corner_sigma_px: by default estimated from the recording itself.
-    """
-    if corner_sigma_px is None:
-        corner_sigma_px = estimate_corner_sigma_px(recording)
-    lanes = np.arange(1 if one_at_a_time else len(recording.markers.ids))
-    return Navigator(
-        rig=recording.rig,
-        markers=jax.tree.map(lambda leaf: leaf[0], maps(recording.markers, lanes[None])),
-        selector=make_selector(selector),
-        motion=ConstantVelocity(),
-        corner_sigma_px=corner_sigma_px,
-    )
-
-
-def sequences_of_recording(
-    recording: Recording,
-    one_at_a_time: bool,
-    part: tuple[float, float],
-    length: int = 64,
-    shortest: int = 10,
-) -> FrameSequences:
-    """Sequences of a recording, judged where the reference knows the pose and a marker is in view.
-
-    Args:
-        one_at_a_time: a sequence is an appearance of one marker, as if it were the only one, and
-            has the frames that show it; else it has all markers and consecutive frames. Either
-            ends at a gap of more than `GAP_S`, and is cut in equal pieces where it is too long.
-        part: which of the frames, as shares of them: (0, 0.5) is the first half.
-        length: frames of a sequence, at most.
-        shortest: sequences of fewer frames are left out.
-
-    Raises:
-        BadInput: there are fewer than `LEAST_SEQUENCES`.
-    """
-    begin, end = bounds(len(recording), part)
-    seen = recording.seen
-    markers, pieces = [], []
-    for marker in range(seen.shape[1] if one_at_a_time else 1):
-        frames = np.arange(begin, end)
-        if one_at_a_time:
-            frames = frames[seen[begin:end, marker]]
-        for appearance in runs(frames, recording.stamps_ns, GAP_S):
-            for piece in cut(appearance, length):
-                if len(piece) >= shortest:
-                    markers.append(marker)
-                    pieces.append(piece)
-    if len(pieces) < LEAST_SEQUENCES:
-        what = "of one marker without a gap" if one_at_a_time else "without a gap"
-        raise BadInput(
-            recording.name,
-            f"{end - begin} of its {len(recording)} frames give {len(pieces)} sequences of "
-            f"{shortest} frames or more {what}: at least {LEAST_SEQUENCES} are needed",
-        )
-    return _recorded(recording, np.array(markers) if one_at_a_time else None, pieces)
-
-
-def _recorded(
-    recording: Recording, markers: Int[np.ndarray, " B"] | None, pieces: list[np.ndarray]
-) -> FrameSequences:
-    """Pieces of a recording as sequences side by side.
-
-    Args:
-        markers: the only marker of each piece; None for all of them.
-    """
-    frames, used = side_by_side(pieces)
-    if markers is None:
-        lanes = np.tile(np.arange(len(recording.markers.ids)), (len(pieces), 1))
-        corners_px, visible = (
-            lanes_of.reshape(*frames.shape, *lanes_of.shape[1:])
-            for lanes_of in recording.lanes(frames.ravel())
-        )
-    else:
-        lanes = markers[:, None]
-        # Piece by piece, so that all markers but one of a large map are dropped at once.
-        alone = [
-            [lanes_of[:, :, [marker]] for lanes_of in recording.lanes(piece)]
-            for piece, marker in zip(frames, markers, strict=True)
-        ]
-        corners_px, visible = (np.stack(rows) for rows in zip(*alone, strict=True))
-    visible = visible & used[:, :, None, None]
-    corners_px = np.where(visible[..., None, None], corners_px, 0.0)
-    stamps_ns = recording.stamps_ns[frames]
-    dt_s = np.diff(stamps_ns, axis=1, prepend=stamps_ns[:, :1]) / 1e9
-    odometry, told = recording.odometry, {}
-    if odometry is not None:
-        told["twist"] = jnp.asarray([odometry.twists(piece) for piece in stamps_ns], float)
-    reference = recording.reference
-    truth, judged = np.tile(IDENTITY, (*frames.shape, 1)), np.zeros(frames.shape, bool)
-    if reference is not None:
-        judged = used & reference.valid[frames] & visible.any(axis=(2, 3))
-        known = reference.valid[frames][..., None]
-        Ts = poses_in_world(reference.T_world_vehicle[frames], opposite(recording.markers.origin_m))
-        truth = np.where(known, Ts, truth)
-    return FrameSequences(
-        markers=maps(recording.markers, lanes),
-        obs=observations(
-            corners_px=jnp.asarray(corners_px, float),
-            visible=jnp.asarray(visible),
-            dt_s=jnp.asarray(dt_s, float),
-            has_odometry=jnp.zeros(frames.shape, bool),
-            **told,
-        ),
-        used=jnp.asarray(used),
-        T_world_vehicle_true=jnp.asarray(truth, float),
-        judged=jnp.asarray(judged),
-    )

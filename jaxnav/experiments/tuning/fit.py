@@ -192,3 +192,26 @@ def fit_of(arrays: dict[str, Shaped[np.ndarray, "..."]], like: TuningFit) -> Tun
         history=tuple(arrays["history"]),
         **{name: kind(arrays[name]) for name, kind in _SCALARS.items()},
     )
+
+
+@dataclass(frozen=True)
+class EstimatorScores:
+    """The scores of an estimator on drives that had no part in the fit."""
+
+    rmse_m: tuple[float, float, float]  # with its 95 % interval over drives
+    anees: tuple[float, float, float]
+    band: tuple[float, float]  # in which ANEES is consistent, 99.9 %
+    error_m: Float[np.ndarray, " N"]  # of every judged frame
+    indefinite: int  # judged frames whose covariance is indefinite by rounding; not in ANEES
+
+
+@dataclass(frozen=True)
+class ControllerScores:
+    """The results of a controller in one scenario, on seeds never trained on."""
+
+    loss: tuple[float, float, float]  # mean with its 95 % interval
+    parts: dict[str, float]
+    time_s: tuple[float, float, float]  # to the last waypoint
+    success: tuple[float, float, float]
+    poses: Float[np.ndarray, "frames 3"]  # of the first drive
+    waypoints_m: Float[np.ndarray, "W 2"]

@@ -37,7 +37,6 @@ FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("filter", "--seeds", "0"), "--seeds: must be at least 1"),
         (("filter", "--seed", "-1"), "--seed: must be at least 0"),
         (("filter", "--part", "0.5", "0.5"), "--part: must be two parts"),
         (("filter", "--corner-noise-px", "nan"), "--corner-noise-px: must be from 0.001 to 100 px"),
@@ -46,8 +45,6 @@ FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
         (("filter", "drive.mcap", "--route", "r.yaml"), "--route: is of simulated drives"),
         (("controller", "--base", "omni", "--vehicle", "v.yaml"), "--base: omni takes the place"),
         (("filter", "--params", "nowhere.yaml"), "nowhere.yaml: "),
-        (("controller", "--steps", "0"), "--steps: must be at least 1"),
-        (("controller", "--effort", "-1"), "--effort: must be at least 0"),
         (("controller", "--learning-rate", "inf"), "--learning-rate: must be finite"),
         (("controller", "--test-scenario", "static"), "--scenario: nothing drives in static"),
         (("controller", "--train", "controller.fame"), "--train: there is no controller.fame"),

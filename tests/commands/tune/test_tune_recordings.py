@@ -10,12 +10,12 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune.drives import sequences_of_drive
 from jaxnav.commands.tune.sequences import (
     GAP_S,
     NamedSequences,
     join_sequences,
     navigator_of,
+    sequences_of_drive,
     sequences_of_recording,
 )
 from jaxnav.core.models.geometry import rotation_error_rad
@@ -84,7 +84,7 @@ def long_enough(recording: Recording, begin: int, end: int, shortest: int) -> se
 
 @pytest.mark.parametrize("part", [*HALVES, (0.25, 0.7)])
 def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
-    recorded = jax.device_get(sequences_of_recording(test_7, True, part))
+    recorded = jax.device_get(sequences_of_recording(test_7, part))
     place_of = places(test_7)
     begin, end = (round(share * len(test_7)) for share in part)
     assert recorded.obs.visible.shape[2:] == (4, 1)
@@ -122,23 +122,9 @@ def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
 def test_parts_that_adjoin_share_no_frame(test_7):
     place_of, frames = places(test_7), []
     for part in HALVES:
-        found = detections(sequences_of_recording(test_7, True, part))
+        found = detections(sequences_of_recording(test_7, part))
         frames.append({place_of[corners][0] for row in found for _, corners in row})
     assert max(frames[0]) < round(len(test_7) / 2) <= min(frames[1])
-
-
-def test_all_markers_together_are_frame_after_frame(test_7):
-    recorded, place_of = sequences_of_recording(test_7, False, (0, 1), length=40), places(test_7)
-    assert recorded.obs.visible.shape[2:] == test_7.visible.shape[1:]
-    assert recorded.markers.size_m.shape == (len(recorded), len(test_7.markers.ids))
-    found = [[place_of[corners] for _, corners in row] for row in detections(recorded)]
-    assert len(recorded) >= 9
-    assert len({at for row in found for at in row}) == sum(map(len, found))
-    for row, at in enumerate(found):
-        frames = np.unique([frame for frame, _, _ in at])
-        assert int(recorded.used[row].sum()) == frames[-1] - frames[0] + 1
-        whole = test_7.visible[frames[0] : frames[-1] + 1]
-        assert len(at) == whole.sum()
 
 
 def test_a_frame_without_a_reference_is_not_judged(test_7):
@@ -146,24 +132,24 @@ def test_a_frame_without_a_reference_is_not_judged(test_7):
     known = test_7.reference._replace(valid=valid)
     for reference in (known, None):
         recorded = sequences_of_recording(
-            dataclasses.replace(test_7, reference=reference), True, (0, 0.5)
+            dataclasses.replace(test_7, reference=reference), (0, 0.5)
         )
         assert not recorded.judged.any()
         np.testing.assert_array_equal(recorded.T_world_vehicle_true[0, 0], [1, 0, 0, 0, 0, 0, 0])
 
 
 def test_too_short_a_recording_says_what_is_needed(test_7):
-    short = test_7.first(30)
-    with pytest.raises(BadInput, match=r"^test_7: 15 of its 30 frames give 1 seq.* 4 are needed$"):
-        sequences_of_recording(short, False, (0, 0.5))
+    short = test_7.first(16)
+    with pytest.raises(BadInput, match=r"^test_7: 8 of its 16 frames give 0 seq.* 4 are needed$"):
+        sequences_of_recording(short, (0, 0.5))
 
 
 @pytest.mark.long
 def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
-    recorded = sequences_of_recording(test_7, True, (0, 1), length=12, shortest=6)
+    recorded = sequences_of_recording(test_7, (0, 1), length=12, shortest=6)
     rows = np.linspace(0, len(recorded) - 1, 20).astype(int)
     recorded = recorded.rows(rows)
-    navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
+    navigator = navigator_of(test_7, "multi-hypothesis", corner_sigma_px)
     start = find_starts(navigator, recorded)
     assert start.chosen.mean() >= 0.95
     first = jnp.argmax(estimate_sequences(navigator, recorded).decided, axis=1)
@@ -175,10 +161,10 @@ def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
 
 
 def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_px):
-    navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
+    navigator = navigator_of(test_7, "multi-hypothesis", corner_sigma_px)
     parts = [
-        sequences_of_recording(test_7, True, HALVES[0], 20),
-        sequences_of_recording(test_7, True, HALVES[1], 32),
+        sequences_of_recording(test_7, HALVES[0], 20),
+        sequences_of_recording(test_7, HALVES[1], 32),
     ]
     both = jax.device_get(
         join_sequences(
@@ -198,23 +184,22 @@ def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_
 
 
 def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
-    alone = sequences_of_recording(test_7, True, (0, 1))
-    navigator = navigator_of(test_7, True, "multi-hypothesis", corner_sigma_px)
+    alone = sequences_of_recording(test_7, (0, 1))
+    navigator = navigator_of(test_7, "multi-hypothesis", corner_sigma_px)
     one = NamedSequences("one", navigator, alone)
-    all_markers = NamedSequences("other", navigator, sequences_of_recording(test_7, False, (0, 1)))
-    with pytest.raises(BadInput, match=r"^one, other: must have as many markers .* 1 and 9$"):
-        join_sequences([one, all_markers])
-    visible = alone.obs.visible[:, :, :2]
-    two_cameras = eqx.tree_at(lambda r: r.obs.visible, alone, visible)
-    with pytest.raises(BadInput, match=r"^one, other: must have as many cameras .* 4 and 2$"):
-        join_sequences([one, one._replace(name="other", recorded=two_cameras)])
+    visible = alone.obs.visible
+    for what, counts, changed in (
+        ("markers", "1 and 3", jnp.repeat(visible, 3, axis=3)),
+        ("cameras", "4 and 2", visible[:, :, :2]),
+    ):
+        other = eqx.tree_at(lambda r: r.obs.visible, alone, changed)
+        with pytest.raises(BadInput, match=rf"^one, other: must have as many {what} .* {counts}$"):
+            join_sequences([one, one._replace(name="other", recorded=other)])
     rig = dataclasses.replace(
         test_7.rig,
         Ts_camera_vehicle=jaxlie.SE3(test_7.rig.Ts_camera_vehicle.wxyz_xyz.at[0, 4].add(1e-3)),
     )
-    moved = navigator_of(
-        dataclasses.replace(test_7, rig=rig), True, "multi-hypothesis", corner_sigma_px
-    )
+    moved = navigator_of(dataclasses.replace(test_7, rig=rig), "multi-hypothesis", corner_sigma_px)
     with pytest.raises(BadInput, match=r"^one, other: must have the same rig"):
         join_sequences([one, NamedSequences("other", moved, alone)])
 
