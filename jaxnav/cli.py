@@ -157,15 +157,9 @@ class _Shown:
         return getattr(self._stream, name)
 
 
-@contextlib.contextmanager
-def nothing_hidden() -> Iterator[None]:
+def nothing_hidden() -> contextlib.redirect_stdout[TextIO]:
     """While the block runs, whatever is printed to the standard output is made visible."""
-    before = sys.stdout
-    sys.stdout = cast(TextIO, _Shown(before))
-    try:
-        yield
-    finally:
-        sys.stdout = before
+    return contextlib.redirect_stdout(cast(TextIO, _Shown(sys.stdout)))
 
 
 def _parse(args: list[str]) -> Any:
@@ -177,25 +171,18 @@ def _parse(args: list[str]) -> Any:
 
     args, words = _without_ros_args(args)
     messages = io.StringIO()
-    wide = not {"-h", "--help"} & set(args)
     try:
-        with (
-            contextlib.redirect_stderr(messages),
-            _unwrapped() if wide else contextlib.nullcontext(),
-        ):
+        with contextlib.redirect_stderr(messages), _lines_unwrapped(args):
             command: Any = tyro.cli(
-                all_arguments(),
-                prog="jaxnav",
-                description=DESCRIPTION,
-                args=args,
+                all_arguments(), prog="jaxnav", description=DESCRIPTION, args=args
             )
-            command = getattr(command, "what", command)  # of a group
-            check_values(command)
-            return dataclasses.replace(command, ros_args=words) if words else command
     except SystemExit as finished:
         if not finished.code:
             return None
-    raise UsageError(_one_line(messages.getvalue()))
+        raise UsageError(_one_line(messages.getvalue())) from None
+    command = getattr(command, "what", command)  # of a group
+    check_values(command)
+    return dataclasses.replace(command, ros_args=words) if words else command
 
 
 def _without_ros_args(args: list[str]) -> tuple[list[str], tuple[str, ...]]:
@@ -207,17 +194,16 @@ def _without_ros_args(args: list[str]) -> tuple[list[str], tuple[str, ...]]:
 
 
 @contextlib.contextmanager
-def _unwrapped() -> Iterator[None]:
-    """Let tyro print long lines whole, so that no path in a message is broken in two."""
+def _lines_unwrapped(args: list[str]) -> Iterator[None]:
+    """Let tyro print long lines whole except of help, so that no path in a message is broken."""
     before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = "100000"
+    if not {"-h", "--help"} & set(args):
+        os.environ["COLUMNS"] = "100000"
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["COLUMNS"]
-        else:
-            os.environ["COLUMNS"] = before
+        os.environ.pop("COLUMNS", None)
+        os.environ |= {} if before is None else {"COLUMNS": before}
 
 
 def _one_line(box: str) -> str:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import tyro
 from annotated_types import Ge, Gt, Lt
@@ -83,7 +83,7 @@ def check_values(command: Any) -> None:
 
     for field in fields(command):
         try:
-            TypeAdapter(field.type).validate_python(getattr(command, field.name))
+            TypeAdapter(cast(Any, field.type)).validate_python(getattr(command, field.name))
         except ValidationError as invalid:
             error = invalid.errors(include_url=False)[0]
             problem = error["msg"]

@@ -1,4 +1,4 @@
-"""What `jaxnav calibrate` can be told."""
+"""Arguments of `jaxnav calibrate`."""
 
 import math
 import re
@@ -254,7 +254,7 @@ class CalibrateConvert:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What those are told that find places by what the cameras saw."""
+    """Arguments shared by rig, markers and check."""
 
     recordings: Recordings
 

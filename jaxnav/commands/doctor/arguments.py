@@ -1,4 +1,4 @@
-"""What `jaxnav doctor` can be told."""
+"""Arguments of `jaxnav doctor`."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the commands that drive a car, or read a recording or a photograph, can be told."""
+"""Arguments of the commands that drive a car, or read a recording or a photograph."""
 
 from dataclasses import dataclass
 from pathlib import Path

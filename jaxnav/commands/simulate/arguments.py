@@ -1,4 +1,4 @@
-"""What the commands that simulate cars can be told."""
+"""Arguments of the commands that simulate cars."""
 
 from dataclasses import dataclass
 from pathlib import Path
