@@ -97,6 +97,8 @@ class RenderedWorld:
 
 
 _FOLLOW_WITHIN_PX = 15.0  # of its expected place
+# Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant.
+Seen = tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]
 
 
 @dataclass
@@ -111,78 +113,51 @@ class RenderedCameras:
     trackers: Sequence[Tracker] = ()
     # The latest, one a camera.
     images: list[UInt8[np.ndarray, "rows columns"]] = field(default_factory=list)
-    _stamp_s: float = 0.0
     _before: tuple[float, np.ndarray] | None = None  # the last stamp and prediction
 
-    def look(
-        self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None
-    ) -> tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]:
-        """Corners (C, M, 4, 2), visibility (C, M) and sigmas (C, M, 4) at one instant."""
-        self._stamp_s = stamp_s
+    def look(self, T_world_vehicle_at: PoseAt, stamp_s: float, believed: Output | None) -> Seen:
+        """What all cameras see at one instant."""
         self.images = self.world.renderer.render(T_world_vehicle_at, stamp_s, self.rng)
-        return self.search(self.images, believed)
+        return self.search(self.images, believed, stamp_s)
 
     def search(
-        self, images: Sequence[UInt8[np.ndarray, "rows columns"]], believed: Output | None
-    ) -> tuple[Float[np.ndarray, "C M 4 2"], Bool[np.ndarray, "C M"], Float[np.ndarray, "C M 4"]]:
+        self,
+        images: Sequence[UInt8[np.ndarray, "rows columns"]],
+        believed: Output | None,
+        stamp_s: float = 0.0,
+    ) -> Seen:
         """What `look` returns, from images (one a camera) that are there already."""
-        predicted_px, expected = self._predicted(believed)
-        detections = [
-            Detections.concatenate(
-                [
-                    detector.detect(image, self.world.cameras[c], predicted_px[c][expected[c]])
-                    for detector in self.detectors
-                ]
-            )
-            for c, image in enumerate(images)
-        ]
-        detections = self._followed(images, detections, predicted_px, expected)
-        observed = observe(detections, self.world.setup.markers)
+        rig, markers = self.world.setup.rig, self.world.setup.markers
+        predicted_px = np.zeros((len(rig), len(markers.ids), 4, 2))
+        expected = np.zeros(predicted_px.shape[:2], bool)
+        if believed is not None and believed.located:
+            predicted_px, expected = jax.device_get(expected_corners(rig, markers, believed.pose))
+        flow_px_s, ahead_s = None, 0.0
+        if self._before is not None and self._before[0] < stamp_s:
+            ahead_s = stamp_s - self._before[0]  # what is believed is of the frame before
+            flow_px_s = np.mean(predicted_px - self._before[1], axis=-2) / ahead_s
+        self._before = (stamp_s, predicted_px) if expected.any() else None
+        detections, keys = [], marker_keys(markers)
+        for c, (image, camera) in enumerate(zip(images, self.world.cameras, strict=True)):
+            quads_px = predicted_px[c][expected[c]]
+            found = [detector.detect(image, camera, quads_px) for detector in self.detectors]
+            if self.trackers and len(quads_px):
+                more = self.trackers[c].follow(
+                    image,
+                    camera,
+                    [key for key, sees in zip(keys, expected[c], strict=True) if sees],
+                    quads_px,
+                    np.full(len(quads_px), _FOLLOW_WITHIN_PX),
+                    None if flow_px_s is None else flow_px_s[c][expected[c]],
+                    ahead_s,
+                    Detections.concatenate(found),
+                )
+                found.append(more)
+            detections.append(Detections.concatenate(found))
+        observed = observe(detections, markers)
         noise_px = self.corner_noise_px * self.rng.standard_normal(observed.corners_px.shape)
         sigma_px = np.hypot(observed.sigma_px, self.corner_noise_px)
         return observed.corners_px + noise_px, observed.visible, sigma_px
-
-    def _followed(
-        self,
-        images: Sequence[np.ndarray],
-        detections: Sequence[Detections],
-        predicted_px: np.ndarray,
-        expected: np.ndarray,
-    ) -> list[Detections]:
-        """The detections of each camera, with the expected markers that were followed."""
-        followed = list(detections)
-        if not self.trackers:
-            return followed
-        keys = marker_keys(self.world.setup.markers)
-        flow_px_s, ahead_s, now = None, 0.0, (self._stamp_s, predicted_px)
-        if self._before is not None and self._before[0] < self._stamp_s:
-            moved_px = np.mean(predicted_px - self._before[1], axis=-2)
-            # What is believed is of the frame before.
-            ahead_s = self._stamp_s - self._before[0]
-            flow_px_s = moved_px / ahead_s
-        self._before = now if expected.any() else None
-        for c, tracker in enumerate(self.trackers):
-            if not expected[c].any():
-                continue
-            more = tracker.follow(
-                images[c],
-                self.world.cameras[c],
-                [key for key, sees in zip(keys, expected[c], strict=True) if sees],
-                predicted_px[c][expected[c]],
-                np.full(int(expected[c].sum()), _FOLLOW_WITHIN_PX),
-                None if flow_px_s is None else flow_px_s[c][expected[c]],
-                ahead_s,
-                detections[c],
-            )
-            followed[c] = Detections.concatenate([detections[c], more])
-        return followed
-
-    def _predicted(self, believed: Output | None) -> tuple[np.ndarray, np.ndarray]:
-        rig, markers = self.world.setup.rig, self.world.setup.markers
-        lanes = (len(rig), len(markers.ids))
-        if believed is None or not believed.located:
-            return np.zeros((*lanes, 4, 2)), np.zeros(lanes, bool)
-        return jax.device_get(expected_corners(rig, markers, believed.pose))
 
 
 @jax.jit
