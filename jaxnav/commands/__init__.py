@@ -99,7 +99,7 @@ COMMANDS = {
         in_folder=("rig.yaml", *_MAP),
     ),
     "calibrate markers": Registered(
-        "calibrate.arguments:CalibrateMarkers", "calibrate.markers", in_folder=_MAP
+        "calibrate.arguments:CalibrateMarkers", "calibrate.rig", in_folder=_MAP
     ),
     "calibrate check": Registered(
         "calibrate.arguments:CalibrateCheck", "calibrate.check", in_folder=_MAP
