@@ -99,7 +99,7 @@ COMMANDS = {
     ),
     "calibrate compare": Command(CalibrateCompare, "calibrate.compare", in_folder=_REPORT),
     "calibrate rig": Command(CalibrateRig, "calibrate.rig", in_folder=("rig.yaml", *_MAP)),
-    "calibrate markers": Command(CalibrateMarkers, "calibrate.markers", in_folder=_MAP),
+    "calibrate markers": Command(CalibrateMarkers, "calibrate.rig", in_folder=_MAP),
     "calibrate check": Command(CalibrateCheck, "calibrate.check", in_folder=_MAP),
     "calibrate odometry": Command(
         CalibrateOdometry, "calibrate.odometry", in_folder=("vehicle.yaml", *_REPORT)

@@ -176,8 +176,8 @@ def test_its_drive_is_shown(pictured, here, tmp_path):
 
 
 def test_the_doctor_finds_it_well(stranger, pictures, here, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxnav.commands.doctor.machine.clock", list)
-    monkeypatch.setattr("jaxnav.commands.doctor.machine.disk", lambda folder: [])
+    monkeypatch.setattr("jaxnav.commands.doctor.computer.clock", list)
+    monkeypatch.setattr("jaxnav.commands.doctor.computer.disk", lambda folder: [])
     frames = [f"--frame={name}={path}" for name, path in pictures.items()]
     code, out, _ = here("doctor", *stranger.flags(), *frames, "--json", tmp_path / "found.json")
     assert code == 0, out

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from jaxnav.commands import pictures
+from jaxnav.commands import report
 from jaxnav.commands.process import configure_jax
 from tests.fuzz import judge, seeds
 from tests.fuzz.cases import LOADERS, drawn, undamaged
@@ -31,7 +31,7 @@ def main() -> None:
     said = os.fdopen(os.dup(1), "w", buffering=1)
     os.environ.setdefault("JAXNAV_FUZZ_CACHE", str(scratch.parent / "cache"))
     os.environ["XDG_CACHE_HOME"] = os.environ["JAXNAV_FUZZ_CACHE"]
-    pictures.PNG_DPI = _DPI
+    report.PNG_DPI = _DPI
     (scratch / "temporary").mkdir(parents=True, exist_ok=True)
     tempfile.tempdir = str(scratch / "temporary")
     configure_jax(float64=False)

@@ -1,18 +1,16 @@
 """`jaxnav calibrate adopt`: what a drive has learnt, as a new rig and a new vehicle."""
 
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from jaxnav.commands.calibrate.arguments import CalibrateAdopt
+from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
-from jaxnav.commands.report import save_figure
 from jaxnav.core.models.vehicle import SENSOR_ERRORS
-from jaxnav.errors import BadInput, visible
-from jaxnav.files import output_folder, write_json
-from jaxnav.files.provenance import calibrated_now
+from jaxnav.errors import BadInput
+from jaxnav.files import output_folder
 from jaxnav.files.vehicles import as_car
 from jaxnav.files.writing import atomic_write_all
 from jaxnav.pictures.learnt import learnt_over_time
@@ -40,23 +38,20 @@ def run(args: CalibrateAdopt) -> int:
     errors, sigma = log.outcomes.errors, log.outcomes.errors_sigma
     learnt = Learnt.of(errors[index], sigma[index], setup.rig, vehicle)
     assert learnt is not None  # _last_sure
-    calibrated = calibrated_now(f"jaxnav {version('jaxnav')} calibrate adopt", [log.path])
+    calibrated = provenance("adopt", [log.path])
     out = output_folder(args.out)
     texts = adopted_files(setup, learnt, calibrated, given.get("rig"), given.get("vehicle"))
     atomic_write_all({out / name: text for name, text in texts.items()})
-    report = {
+    cameras_deg = np.rad2deg([learnt.turns_rad, learnt.turns_sigma_rad])
+    report = calibrated.model_dump() | {
         "recording": str(log.path),
         "time_s": float(log.outcomes.times_s[index]),
         "sensors": _columns(SENSOR_ERRORS, learnt.sensors, learnt.sensors_sigma),
-        "cameras_deg": _columns(
-            setup.rig.names, np.rad2deg(learnt.turns_rad), np.rad2deg(learnt.turns_sigma_rad)
-        ),
+        "cameras_deg": _columns(setup.rig.names, *cameras_deg),
     }
-    write_json(out / "report.json", calibrated.model_dump() | report)
-    save_figure(learnt_over_time(log.outcomes, setup.rig, vehicle), out / "report.png")
-    for sentence in learnt.sentences() or ["nothing is off by three of its sigmas"]:
-        print(visible(sentence))
-    print(f"{', '.join([*texts, 'report.json', 'report.png'])} in {visible(out)}")
+    figure = learnt_over_time(log.outcomes, setup.rig, vehicle)
+    lines = learnt.sentences() or ["nothing is off by three of its sigmas"]
+    publish(out, report, figure, lines, texts)
     return 0
 
 

@@ -55,9 +55,10 @@ def run(args: CalibrateBoard) -> int:
     print(f"{folder / 'board.pdf'}, {folder / 'board.png'}, {folder / 'board.yaml'}")
     print("\n".join(_ADVICE))
     if board.kind == "marker":
+        family = "" if board.family == "tag36h11" else f" --family {board.family}"
         print(
-            f"Photograph it with a calibrated camera: {_locate(board)}, the side as measured where "
-            "a ruler is off"
+            "Photograph it with a calibrated camera: jaxnav locate PHOTO --camera camera.yaml "
+            f"--marker-size-m {board.size_m:g}{family}, the side as measured where a ruler is off"
         )
     else:
         print(
@@ -65,12 +66,6 @@ def run(args: CalibrateBoard) -> int:
             f"jaxnav calibrate intrinsics FOLDER --board {folder / 'board.yaml'}"
         )
     return 0
-
-
-def _locate(marker: Board) -> str:
-    """The command that finds the marker in a photograph."""
-    family = "" if marker.family == "tag36h11" else f" --family {marker.family}"
-    return f"jaxnav locate PHOTO --camera camera.yaml --marker-size-m {marker.size_m:g}{family}"
 
 
 def _paper_mm(args: CalibrateBoard) -> tuple[float, float]:

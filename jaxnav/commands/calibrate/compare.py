@@ -7,10 +7,10 @@ import numpy as np
 
 from jaxnav.calibrate.lens.maps import ImageMap, projection_difference
 from jaxnav.commands.calibrate.arguments import CalibrateCompare
+from jaxnav.commands.calibrate.report import publish
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.report import save_figure
 from jaxnav.errors import BadInput
-from jaxnav.files import output_folder, write_json
+from jaxnav.files import output_folder
 from jaxnav.files.cameras import camera_file
 from jaxnav.files.figures import CameraFigures
 from jaxnav.files.reading import read_mapping
@@ -26,19 +26,17 @@ def run(args: CalibrateCompare) -> int:
         name: projection_difference(one.camera(), other.camera(), one.image_size_px)
         for name, (one, other) in pairs.items()
     }
-    report = {name: _report(*pairs[name], maps[name]) for name in pairs}
-    title = f"where {args.other} draws the rays of\n{args.one}"
-    save_figure(comparison(maps, title), folder / "report.png")
-    files = {"one": str(args.one), "other": str(args.other)}
-    write_json(folder / "report.json", files | {"cameras": report})
-    for name, one in report.items():
-        print(
-            f"{name}: {one['rms_px']:.3g} px RMS apart, {one['largest_px']:.3g} px at most at "
-            f"({one['largest_at_px'][0]:.0f}, {one['largest_at_px'][1]:.0f}); focal length "
-            f"{one['focal_px'][0][0]:.6g} and {one['focal_px'][1][0]:.6g} px, "
-            f"{one['undrawn_percent']:.0f} % of the image not drawn by both"
-        )
-    print(f"{folder / 'report.png'}, {folder / 'report.json'}")
+    cameras = {name: _report(*pairs[name], maps[name]) for name in pairs}
+    figure = comparison(maps, f"where {args.other} draws the rays of\n{args.one}")
+    lines = [
+        f"{name}: {one['rms_px']:.3g} px RMS apart, {one['largest_px']:.3g} px at most at "
+        f"({one['largest_at_px'][0]:.0f}, {one['largest_at_px'][1]:.0f}); focal length "
+        f"{one['focal_px'][0][0]:.6g} and {one['focal_px'][1][0]:.6g} px, "
+        f"{one['undrawn_percent']:.0f} % of the image not drawn by both"
+        for name, one in cameras.items()
+    ]
+    report = {"one": str(args.one), "other": str(args.other), "cameras": cameras}
+    publish(folder, report, figure, lines, ())
     return 0
 
 
@@ -67,17 +65,21 @@ def _cameras(path: Path) -> dict[str, CameraFigures]:
 
 
 def _report(one: CameraFigures, other: CameraFigures, difference: ImageMap) -> dict[str, Any]:
-    length_px = difference.length_px
+    both, length_px = (one, other), difference.length_px
     known = np.isfinite(length_px)
-    if not known.any():
-        return {"undrawn_percent": 100.0, "rms_px": np.nan, "largest_px": np.nan,
-                "largest_at_px": [0, 0], "focal_px": [one.focal_px, other.focal_px]}  # fmt: skip
-    most = np.unravel_index(np.nanargmax(length_px), length_px.shape)
-    return {
-        "rms_px": float(np.sqrt(np.mean(length_px[known] ** 2))),
-        "largest_px": float(length_px[most]),
-        "largest_at_px": difference.pixels[most].tolist(),
+    report: dict[str, Any] = {
+        "rms_px": np.nan,
+        "largest_px": np.nan,
+        "largest_at_px": [0, 0],
         "undrawn_percent": float(100 * np.mean(~known)),
-        "focal_px": [list(camera.focal_px) for camera in (one, other)],
-        "center_px": [list(camera.center_px) for camera in (one, other)],
+        "focal_px": [list(camera.focal_px) for camera in both],
+        "center_px": [list(camera.center_px) for camera in both],
     }
+    if known.any():
+        most = np.unravel_index(np.nanargmax(length_px), length_px.shape)
+        report |= {
+            "rms_px": float(np.sqrt(np.mean(length_px[known] ** 2))),
+            "largest_px": float(length_px[most]),
+            "largest_at_px": difference.pixels[most].tolist(),
+        }
+    return report

@@ -42,20 +42,30 @@ class _Source:
     left_out: tuple[str, ...]
 
 
+@dataclass
+class _Written:
+    """What is to be written, a word about each file, and what is not carried over."""
+
+    contents: dict[Path, str]
+    words: dict[Path, str]
+    left_out: list[str]
+
+
 def run(args: CalibrateConvert) -> int:
     """Read SOURCE, write it in the other format, and print what was left out."""
     source = _read(args)
     _refuse_flags(args, source)
     if source.format == args.to:
         raise BadInput(args.source, f"is {args.to}'s already: nothing to convert")
-    if source.markers:
-        written, left_out = _write_markers(args, source)
-    else:
-        written, left_out = _write_cameras(args, source)
-    for path, what in written.items():
+    written = _markers(args, source) if source.markers else _cameras(args, source)
+    refuse_overwriting("--out", written.contents, [args.source])
+    for folder in {path.parent for path in written.contents}:
+        output_folder(folder)
+    atomic_write_all(written.contents)
+    for path, what in written.words.items():
         print(f"{visible(path)}: {what}")
-    if left_out:
-        print(f"not carried over: {', '.join(left_out)}")
+    if written.left_out:
+        print(f"not carried over: {', '.join(written.left_out)}")
     return 0
 
 
@@ -89,55 +99,54 @@ def _refuse_flags(args: CalibrateConvert, source: _Source) -> None:
             raise BadInput(flag, problem)
 
 
-def _write_markers(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, str], list[str]]:
+def _markers(args: CalibrateConvert, source: _Source) -> _Written:
     if args.to not in ("jaxnav", "wpilib"):
         raise BadInput(args.source, f"holds markers, and {args.to} does not: --to jaxnav or wpilib")
     markers, left_out = source.markers, list(source.left_out)
-    count = f"{len(markers)} marker{'s' if len(markers) > 1 else ''}"
+    count, one = f"{len(markers)} marker{'s' if len(markers) > 1 else ''}", markers[0]
     if args.to == "jaxnav":
-        text, figures = markers_text(markers), f"{count} of {markers[0].family}, "
-        figures += f"{markers[0].size_m:g} m, as jaxnav's detectors see them"
+        text = markers_text(markers)
+        words = f"{count} of {one.family}, {one.size_m:g} m, as jaxnav's detectors see them"
     else:
         length, width = args.field_size_m or wpilib.extent_m(markers)
         if min(length, width) <= 0:
             raise BadInput("--field-size-m", "missing: the map has no extent to take it from")
         text = wpilib.layout_text(markers, (length, width))
-        figures = f"{count} on a field of {length:g} x {width:g} m"
-        left_out.append(f"family {markers[0].family}")
-        left_out.append(f"size_m {markers[0].size_m!r} (--marker-size-m on the way back)")
+        words = f"{count} on a field of {length:g} x {width:g} m"
+        left_out.append(f"family {one.family}")
+        left_out.append(f"size_m {one.size_m!r} (--marker-size-m on the way back)")
     _require_suffix(args.to, args.out)
-    _write(args.source, {args.out: text})
-    return {args.out: figures}, left_out
+    return _Written({args.out: text}, {args.out: words}, left_out)
 
 
-def _write_cameras(args: CalibrateConvert, source: _Source) -> tuple[dict[Path, str], list[str]]:
+def _cameras(args: CalibrateConvert, source: _Source) -> _Written:
     if args.to == "wpilib":
         raise BadInput(args.source, "holds cameras, and a WPILib layout holds markers")
-    cameras = _chosen(args, source)
-    left_out = list(source.left_out)
+    cameras, left_out = _chosen(args, source), list(source.left_out)
+    words = [f"{c.name} {c.image_size_px[0]} x {c.image_size_px[1]} {c.lens}" for c in cameras]
     timed = [camera.name for camera in cameras if camera.timing != UNKNOWN_TIMING]
     if timed and args.to != "jaxnav":
         left_out.append(f"when the sensors of {', '.join(timed)} see (exposure_s, row_time_s)")
     if args.to in _MANY:
         _require_suffix(args.to, args.out)
-        contents = {args.out: _MANY[args.to](cameras)}
-        written = {args.out: ", ".join(_figures_text(camera) for camera in cameras)}
-    else:
-        write = _ONE[args.to]
-        paths = _paths(args, cameras)
-        contents = {path: write(camera) for path, camera in zip(paths, cameras, strict=True)}
-        written = {path: _figures_text(camera) for path, camera in zip(paths, cameras, strict=True)}
-        placed = [camera.name for camera in cameras if camera.T_camera_vehicle is not None]
-        if placed:
-            left_out.append(f"where on the vehicle {', '.join(placed)} {_is(placed)}")
-        bare = [camera.name for camera in cameras if camera.lens == "none"]
-        if bare:
-            left_out.append(f"that {', '.join(bare)} {_is(bare)} without lens: written as zeros")
-        renamed = [c.name for c, path in zip(cameras, paths, strict=True) if c.name != path.stem]
-        if renamed and args.to == "photonvision":
-            left_out.append(f"the name{'s' if len(renamed) > 1 else ''} {', '.join(renamed)}")
-    _write(args.source, contents)
-    return written, left_out
+        return _Written({args.out: _MANY[args.to](cameras)}, {args.out: ", ".join(words)}, left_out)
+    paths = _paths(args, cameras)
+    for names, what in (
+        ([c.name for c in cameras if c.T_camera_vehicle is not None], "where on the vehicle {} {}"),
+        (
+            [c.name for c in cameras if c.lens == "none"],
+            "that {} {} without lens: written as zeros",
+        ),
+    ):
+        if names:
+            left_out.append(what.format(", ".join(names), "is" if len(names) == 1 else "are"))
+    renamed = [c.name for c, path in zip(cameras, paths, strict=True) if c.name != path.stem]
+    if renamed and args.to == "photonvision":
+        left_out.append(f"the name{'s' if len(renamed) > 1 else ''} {', '.join(renamed)}")
+    contents = [_ONE[args.to](camera) for camera in cameras]
+    return _Written(
+        dict(zip(paths, contents, strict=True)), dict(zip(paths, words, strict=True)), left_out
+    )
 
 
 def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraFigures, ...]:
@@ -177,19 +186,3 @@ def _require_suffix(to: str, path: Path) -> None:
     suffixes = _SUFFIXES.get(to, _YAML)
     if path.suffix.lower() not in suffixes:
         raise BadInput("--out", f"must be a file that ends in {suffixes[0]}, got {path}")
-
-
-def _write(source: Path, contents: dict[Path, str]) -> None:
-    refuse_overwriting("--out", contents, [source])
-    for folder in {path.parent for path in contents}:
-        output_folder(folder)
-    atomic_write_all(contents)
-
-
-def _figures_text(camera: CameraFigures) -> str:
-    width, height = camera.image_size_px
-    return f"{camera.name} {width} x {height} {camera.lens}"
-
-
-def _is(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"

@@ -17,6 +17,7 @@ from jaxnav.recordings.other.sightings import RecordedSightings, read_sightings
 
 _LEAST_SIGHTINGS = 3  # of a marker that is in no map
 _APART_NS = 10**12  # between recordings
+_MOST_LISTED = 12
 
 MarkerKey = tuple[str, int]  # family, id
 
@@ -63,7 +64,10 @@ def read_rig_data(
     rig = None if rig_file is None else load_rig(rig_file)
     markers = None if markers_file is None else load_markers(markers_file)
     parts = [read_sightings(path, rig) for path in recordings]
-    _one_rig(parts, recordings)
+    for part, path in zip(parts[1:], recordings[1:], strict=True):
+        if part.rig.names != parts[0].rig.names:
+            problem = f"its cameras are not those of {recordings[0]}: give one --rig for all"
+            raise BadInput(path, problem)
     if markers is None:
         markers = next((part.markers for part in parts if part.markers is not None), None)
     if family is None:
@@ -79,8 +83,12 @@ def read_rig_data(
     anchored = bool(known)
     if not known:
         if markers is not None:
-            ids = ", ".join(str(marker_id) for marker_id in markers.ids)
-            problem = f"none of its markers ({ids}) was seen; seen were {_listed(keys)}"
+            ids = [marker_id for _, marker_id in keys]
+            more = ", ..." if len(ids) > _MOST_LISTED else ""
+            problem = (
+                f"none of its markers ({', '.join(map(str, markers.ids))}) was seen; seen were "
+                f"{', '.join(map(str, ids[:_MOST_LISTED]))}{more}"
+            )
             raise BadInput(markers_file or "--markers", problem)
         known = {index_of[seen.most_common(1)[0][0]]: np.eye(4)}
     marker = np.array([index_of.get(key, -1) for part in parts for key in _keys(part, family)], int)
@@ -96,15 +104,7 @@ def read_rig_data(
         marker_ids=tuple(marker_id for _, marker_id in keys),
         stamps_ns=_one_after_the_other([part.stamps_ns for part in parts]),
     )
-    return RigData(
-        parts[0].rig,
-        views,
-        markers,
-        keys,
-        known,
-        tuple(parts),
-        anchored,
-    )
+    return RigData(parts[0].rig, views, markers, keys, known, tuple(parts), anchored)
 
 
 def _one_after_the_other(stamps_ns: Sequence[np.ndarray]) -> np.ndarray:
@@ -128,13 +128,6 @@ def _keys(part: RecordedSightings, family: str) -> list[MarkerKey]:
     return [(name, int(marker_id)) for name, marker_id in zip(families, part.ids, strict=True)]
 
 
-def _one_rig(parts: Sequence[RecordedSightings], recordings: Sequence[Path]) -> None:
-    for part, path in zip(parts[1:], recordings[1:], strict=True):
-        if part.rig.names != parts[0].rig.names:
-            problem = f"its cameras are not those of {recordings[0]}: give one --rig for all"
-            raise BadInput(path, problem)
-
-
 def _known(
     markers: MarkerMap | None, keys: Sequence[MarkerKey], marker_size_m: float | None
 ) -> tuple[dict[int, np.ndarray], list[float]]:
@@ -155,8 +148,3 @@ def _known(
             problem = f"missing: how large is marker {marker_id} ({family}), which is in no map?"
             raise BadInput("--marker-size-m", problem)
     return known, sizes_m
-
-
-def _listed(keys: Sequence[MarkerKey], most: int = 12) -> str:
-    names = [str(marker_id) for _, marker_id in keys[:most]]
-    return ", ".join(names) + (", ..." if len(keys) > most else "")

@@ -1,13 +1,12 @@
 """`jaxnav calibrate intrinsics`: calibrate the lens of a camera, or of several."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxnav import __version__
 from jaxnav.calibrate.board.images import CollectedViews
 from jaxnav.calibrate.lens.checks import cells, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibrate.lens.images import calibrate_images
@@ -15,12 +14,11 @@ from jaxnav.calibrate.lens.intrinsics import LensCalibration
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board
+from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.report import save_figure
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
-from jaxnav.files import output_folder, write_json
-from jaxnav.files.provenance import Calibrated, calibrated_now
+from jaxnav.files import output_folder
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import (
     CameraEntry,
@@ -65,20 +63,26 @@ def run(args: CalibrateIntrinsics) -> int:
             )
 
     files = [args.board, *(file for one in collected.values() for file in one.files)]
-    calibrated = calibrated_now(f"jaxnav {__version__} calibrate intrinsics", files)
+    calibrated = provenance("intrinsics", files)
     entries = {name: _entry(name, one, placed.get(name)) for name, one in calibrations.items()}
     rig = RigFile(cameras=list((placed | entries).values()))
-    sigmas = [entry.sigma or CameraSigma() for entry in rig.cameras]
     file = folder / "camera.yaml"
-    save_rig(file, rig.rig(), calibrated, sigmas)
-    write_json(folder / "report.json", _report(str(board), calibrated, collected, calibrations))
-    save_figure(lens_report(calibrations), folder / "report.png")
-    for name, one in calibrations.items():
-        print(_text(name, one, collected[name]))
+    save_rig(file, rig.rig(), calibrated, [entry.sigma or CameraSigma() for entry in rig.cameras])
+    advice = [
+        f"{name}: {sentence}" if len(calibrations) > 1 else sentence
+        for name, one in calibrations.items()
+        for sentence in one.advice
+    ]
+    cameras = {name: _report(one, collected[name]) for name, one in calibrations.items()}
+    report = {"board": str(board), "cameras": cameras, "advice": advice}
+    lines = [
+        line for name, one in calibrations.items() for line in _lines(name, one, collected[name])
+    ]
     if not placed:
-        print(f"for a photo: jaxnav locate PHOTO --camera {file} --marker-size-m S")
-        print(f"for a car: write where its cameras are into {file}, or give --rig")
-    print(", ".join(str(folder / name) for name in ("camera.yaml", "report.json", "report.png")))
+        lines.append(f"for a photo: jaxnav locate PHOTO --camera {file} --marker-size-m S")
+        lines.append(f"for a car: write where its cameras are into {file}, or give --rig")
+    figure = lens_report(calibrations)
+    publish(folder, calibrated.model_dump() | report, figure, lines, ["camera.yaml"])
     return 0
 
 
@@ -119,27 +123,7 @@ def _entry(name: str, calibration: LensCalibration, placed: CameraEntry | None) 
     return CameraEntry(name=name, position_m=[0.0, 0.0, 0.0], yaw_deg=yaw_deg, **update)
 
 
-def _report(
-    board: str,
-    calibrated: Calibrated,
-    collected: Mapping[str, CollectedViews],
-    calibrations: Mapping[str, LensCalibration],
-) -> dict[str, Any]:
-    several = len(calibrations) > 1
-    return calibrated.model_dump() | {
-        "board": board,
-        "cameras": {
-            name: _camera_report(one, collected[name]) for name, one in calibrations.items()
-        },
-        "advice": [
-            f"{name}: {sentence}" if several else sentence
-            for name, one in calibrations.items()
-            for sentence in one.advice
-        ],
-    }
-
-
-def _camera_report(calibration: LensCalibration, collected: CollectedViews) -> dict[str, Any]:
+def _report(calibration: LensCalibration, collected: CollectedViews) -> dict[str, Any]:
     fit, seen = calibration.fit, cells(calibration.fit)
     median_deg, spread_deg = tilts_deg(fit)
     return {
@@ -190,32 +174,25 @@ def _notes(calibration: LensCalibration, collected: CollectedViews) -> tuple[str
     return (other, *calibration.findings)
 
 
-def _without_board(views: tuple[str, ...]) -> list[str]:
-    """A line for each view in which the board is not seen; one for many, as of a video."""
-    if not views:
-        return []
-    if len(views) > _NAMED:
-        return [f"  left out: {len(views)} views, {views[0]} first: the board is not seen"]
-    return [f"  left out: {view}: the board is not seen: is it blurred?" for view in views]
-
-
-def _text(name: str, calibration: LensCalibration, collected: CollectedViews) -> str:
-    fit = calibration.fit
+def _lines(name: str, calibration: LensCalibration, collected: CollectedViews) -> Iterator[str]:
+    fit, unseen = calibration.fit, collected.without_board
     used = int(np.sum(fit.view_weights > 0))
-    given = calibration.given + len(collected.without_board) + len(collected.unreadable)
-    lines = [
+    given = calibration.given + len(unseen) + len(collected.unreadable)
+    yield (
         f"{name}: {fit.lens}, {used} of {given} views, {int(fit.used.sum())} corners, "
         f"RMS {fit.rms_px:.3f} px, corner noise {fit.sigma_px:.3f} px"
-    ]
-    for number, parameter in enumerate(fit.names):
-        value, sigma = fit.parameters[number], fit.sigma[number]
+    )
+    for parameter, value, sigma in zip(fit.names, fit.parameters, fit.sigma, strict=False):
         sure = "held at zero" if parameter in fit.fixed else f"+- {sigma:.2g}"
-        lines.append(f"  {parameter:>5} {value:12.6g} {sure}")
-    lines += [f"  left out: {view}: {why}" for view, why in calibration.left_out.items()]
-    lines += [f"  left out: {view}: {why}" for view, why in collected.unreadable]
-    lines += _without_board(collected.without_board)
-    lines += [f"  left out: {view}: repeats {twin}" for view, twin in collected.duplicates]
-    lines += [f"  counts {weight:.2g}: {view}" for view, weight in calibration.downweighted.items()]
-    lines += [f"  note: {sentence}" for sentence in _notes(calibration, collected)]
-    lines += [f"  next: {sentence}" for sentence in calibration.advice]
-    return "\n".join(lines)
+        yield f"  {parameter:>5} {value:12.6g} {sure}"
+    left_out = [*calibration.left_out.items(), *collected.unreadable]
+    if len(unseen) > _NAMED:  # as of a video
+        left_out.append((f"{len(unseen)} views, {unseen[0]} first", "the board is not seen"))
+    else:
+        left_out += [(view, "the board is not seen: is it blurred?") for view in unseen]
+    left_out += [(view, f"repeats {twin}") for view, twin in collected.duplicates]
+    yield from (f"  left out: {view}: {why}" for view, why in left_out)
+    for view, weight in calibration.downweighted.items():
+        yield f"  counts {weight:.2g}: {view}"
+    yield from (f"  note: {sentence}" for sentence in _notes(calibration, collected))
+    yield from (f"  next: {sentence}" for sentence in calibration.advice)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from importlib.metadata import version
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,13 +12,11 @@ from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateOdometry as Arguments
 from jaxnav.commands.calibrate.odometry_recordings import RecordedDrives, read_recordings
+from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.report import corners_in_world, save_figure
+from jaxnav.commands.report import corners_in_world
 from jaxnav.core.models.origin import planar_in_world
-from jaxnav.core.models.vehicle import Vehicle
-from jaxnav.errors import visible
-from jaxnav.files import output_folder, save_vehicle, write_json
-from jaxnav.files.provenance import Calibrated, calibrated_now
+from jaxnav.files import output_folder, save_vehicle
 from jaxnav.pictures.odometry import odometry_report
 
 
@@ -38,44 +35,29 @@ def run(args: Arguments) -> int:
             args.wheelbase_sigma_m,
             bar.update,
         )
-    calibrated = calibrated_now(f"jaxnav {version('jaxnav')} calibrate odometry", recorded.files)
+    calibrated = provenance("odometry", recorded.files)
     out = output_folder(args.out)
-    save_vehicle(
-        out / "vehicle.yaml",
-        calibrated_vehicle(recorded.vehicle, calibration),
-        calibrated,
-        calibration.sigma,
-    )
-    write_json(out / "report.json", report(args, recorded, calibration, calibrated))
-    origin_m = recorded.markers.origin_m
-    drawn = dataclasses.replace(calibration, poses=planar_in_world(calibration.poses, origin_m))
-    figure = odometry_report(drawn, corners_in_world(recorded.markers), table(calibration))
-    save_figure(figure, out / "report.png")
-    print(f"{head(calibration)}\n{table(calibration)}")
+    values: dict[str, Any] = dict(calibration.value)
+    values["wheelbase_m"] = jnp.asarray(values["wheelbase_m"], recorded.vehicle.wheelbase_m.dtype)
+    vehicle = dataclasses.replace(recorded.vehicle, **values)
+    save_vehicle(out / "vehicle.yaml", vehicle, calibrated, calibration.sigma)
+    poses = planar_in_world(calibration.poses, recorded.markers.origin_m)
+    drawn, table = dataclasses.replace(calibration, poses=poses), _table(calibration)
+    lines = [_head(calibration), *table]
     if left_out := sum(drive.left_out for drive in recorded.drives):
-        print(f"left out: {left_out} readings and views that are not finite, or of no car")
-    for sentence in calibration.advice:
-        print(f"next: {sentence}")
-    print(f"vehicle.yaml, report.json and report.png in {visible(out)}")
+        lines.append(f"left out: {left_out} readings and views that are not finite, or of no car")
+    lines += [f"next: {sentence}" for sentence in calibration.advice]
+    report = calibrated.model_dump() | _report(args, recorded, calibration)
+    figure = odometry_report(drawn, corners_in_world(recorded.markers), "\n".join(table))
+    publish(out, report, figure, lines, ["vehicle.yaml"])
     return 0
 
 
-def calibrated_vehicle(vehicle: Vehicle, calibration: OdometryCalibration) -> Vehicle:
-    """The vehicle with the calibrated figures."""
-    values: dict[str, Any] = dict(calibration.value)
-    values["wheelbase_m"] = jnp.asarray(values["wheelbase_m"], vehicle.wheelbase_m.dtype)
-    return dataclasses.replace(vehicle, **values)
-
-
-def report(
-    args: Arguments,
-    recorded: RecordedDrives,
-    calibration: OdometryCalibration,
-    calibrated: Calibrated,
+def _report(
+    args: Arguments, recorded: RecordedDrives, calibration: OdometryCalibration
 ) -> dict[str, Any]:
-    """The content of report.json."""
     speed_mps, steering_rad = np.abs(calibration.read[:, 0]), calibration.read[:, 1]
-    return calibrated.model_dump() | {
+    return {
         "recordings": list(args.recordings),
         "reprojection_rms_px": calibration.rms_px,
         "chi2_per_dof": calibration.chi2_per_dof,
@@ -105,7 +87,7 @@ def report(
     }
 
 
-def head(calibration: OdometryCalibration) -> str:
+def _head(calibration: OdometryCalibration) -> str:
     """A line with distance, duration, views, and how well the fit explains them."""
     return (
         f"{calibration.way_m:.1f} m in {calibration.duration_s:.0f} s, "
@@ -115,7 +97,7 @@ def head(calibration: OdometryCalibration) -> str:
     )
 
 
-def table(calibration: OdometryCalibration) -> str:
+def _table(calibration: OdometryCalibration) -> list[str]:
     """A line for each figure: before, found, one sigma."""
     lines = [f"{'':20}{'before':>10}{'found':>11}{'sigma':>10}"]
     for name in NAMES:
@@ -124,4 +106,4 @@ def table(calibration: OdometryCalibration) -> str:
         lines.append(
             f"{name:20}{calibration.before[name]:10.4f}{calibration.value[name]:11.5f}{sigma_text}"
         )
-    return "\n".join(lines)
+    return lines

@@ -1,9 +1,8 @@
 """Recorded drives as data for the calibration of odometry."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,6 +25,16 @@ from jaxnav.recordings.other.recording import check_winding
 from jaxnav.recordings.other.ros_drives import read_ros_drive
 
 _NONE = Detections.concatenate([])
+_READING = np.dtype([("stamp_ns", np.int64), ("speed_mps", float), ("steering_rad", float)])
+_VIEW = np.dtype(
+    [
+        ("stamp_ns", np.int64),
+        ("camera", int),
+        ("marker", int),
+        ("corners_px", float, (4, 2)),
+        ("sigma_px", float, 4),
+    ]
+)
 _SHARED = ("rig", "markers", "vehicle")  # header keys that must agree in all recordings
 
 
@@ -116,7 +125,12 @@ def drive_of(
     for given in inputs:
         if given.odometry is not None and given.odometry.valid:
             read = given.odometry
-            if isinstance(read, Odometry) and _is_sound(read):
+            if (
+                isinstance(read, Odometry)
+                and is_within("speed_mps", read.speed_mps)
+                and is_within("steering_rad", read.steering_rad)
+                and read.stamp_ns > 0
+            ):
                 readings.append((read.stamp_ns, read.speed_mps, read.steering_rad))
             else:
                 left_out += 1
@@ -140,29 +154,12 @@ def drive_of(
                 else:
                     left_out += 1
     check_winding(name, np.concatenate(detected_px))
-    read_columns = _columns(readings, 3)
-    columns = _columns(views, 5)
+    reading, view = np.array(readings, _READING), np.array(views, _VIEW)
     return Drive(
-        name,
-        np.array(read_columns[0], np.int64),
-        np.array(read_columns[1], float),
-        np.array(read_columns[2], float),
-        np.array(columns[0], np.int64),
-        np.array(columns[1], int),
-        np.array(columns[2], int),
-        np.array(columns[3], float).reshape(-1, 4, 2),
-        np.array(columns[4], float).reshape(-1, 4),
+        name, reading["stamp_ns"], reading["speed_mps"], reading["steering_rad"],
+        view["stamp_ns"], view["camera"], view["marker"], view["corners_px"], view["sigma_px"],
         left_out,
-    )
-
-
-def _is_sound(read: Odometry) -> bool:
-    sound = is_within("speed_mps", read.speed_mps) and is_within("steering_rad", read.steering_rad)
-    return bool(sound) and read.stamp_ns > 0
-
-
-def _columns(rows: Sequence[tuple[Any, ...]], count: int) -> list[tuple[Any, ...]]:
-    return list(zip(*rows, strict=True)) if rows else [()] * count
+    )  # fmt: skip
 
 
 def _files(path: Path) -> list[Path]:

@@ -1,19 +1,24 @@
-"""Findings of the doctor: one line for each, and what to do about it.
+"""Findings of the doctor: what was looked at, what was found, and what helps.
 
-This module imports nothing heavy: it must work where JAX, OpenCV or a driver does not.
+They are worded in `findings.toml`. This module imports nothing heavy: it must work where JAX,
+OpenCV or a driver does not.
 """
 
 import dataclasses
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Literal, TypeVar
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, cast
 
 from jaxnav.errors import BadInput
 
 Level = Literal["ok", "note", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "note", "ok")
+TEXTS: dict[str, dict[str, dict[str, str]]] = tomllib.loads(
+    Path(__file__).with_name("findings.toml").read_text("utf-8")
+)
 
 EXIT_ERROR_FOUND = 1
 EXIT_UNREADABLE = 2
@@ -21,24 +26,24 @@ EXIT_UNREADABLE = 2
 _SHOWN = {"ok": "ok", "note": "note", "warning": "WARNING", "error": "ERROR"}
 _NAME_WIDTH = 13  # of the longest name, "compile cache"
 
-Loaded = TypeVar("Loaded")
-
 
 @dataclass(frozen=True)
 class Finding:
     """The result of one check.
 
     Attributes:
-        name: of the thing that was checked; empty: the one that `Report.examine` was told.
+        name: of the thing that was checked.
         level: "ok"; "note", good to know; "warning", it may go wrong; "error", it will.
         what: the result in one line.
         do: what a person can do about it.
+        key: where its words stand in `findings.toml`, as in "clock.late"; empty for others.
     """
 
     name: str
     level: Level
     what: str
     do: str = ""
+    key: str = ""
 
     def __str__(self) -> str:
         """One line, in columns that are the same for all findings, and `do` indented below."""
@@ -46,8 +51,18 @@ class Finding:
         return f"{line}\n{'':9}do: {_one_line(self.do)}" if self.do else line
 
 
-# Called with `what` and `do`, or with `what` alone.
-error, warning, note, ok = (partial(Finding, "", level) for level in LEVELS)
+def found(key: str, at_level: str | None = None, **figures: Any) -> Finding:
+    """The finding that stands under a key of `findings.toml`, with these figures in its words.
+
+    Args:
+        at_level: a level other than the one there.
+    """
+    name, _, short = key.partition(".")
+    entry = TEXTS[name][short]
+    level = next(level for level in LEVELS if level in entry)
+    what, do = entry[level].format_map(figures), entry.get("do", "").format_map(figures)
+    shown = cast(Level, at_level or level)
+    return Finding(name, shown, what, "" if shown == "ok" else do, key)
 
 
 @dataclass
@@ -68,16 +83,15 @@ class Report:
         self.findings.append(finding)
         self.show(finding)
 
-    def examine(self, name: str, check: Callable[..., Iterable[Finding]], *told: Any) -> None:
-        """Run a check, and keep what it found before it failed.
+    def examine(self, name: str, check: Callable[[], Iterable[Finding]]) -> None:
+        """Run a check, and keep what it found before it failed, as it may in any way.
 
         Args:
-            name: of findings without a name, and of the one that says that the check failed.
-            check: called with `told`; may raise anything, as a broken installation does.
+            name: of the finding that says that the check failed.
         """
         try:
-            for finding in check(*told):
-                self.add(replace(finding, name=finding.name or name))
+            for finding in check():
+                self.add(finding)
         except BadInput as failure:
             self.unreadable = True
             self.add(Finding(name, "error", str(failure)))
@@ -85,17 +99,6 @@ class Report:
             what = f"could not be looked at: {said(failure)}"
             do = "if the lines about packages are all ok, please report it"
             self.add(Finding(name, "error", what, do))
-
-    def read(self, name: str, load: Callable[[], Loaded]) -> Loaded | None:
-        """Load a file and return its content; None, and a finding, where it can't be read."""
-        loaded: list[Loaded] = []
-
-        def check() -> Iterable[Finding]:
-            loaded.append(load())
-            return ()
-
-        self.examine(name, check)
-        return loaded[0] if loaded else None
 
     @property
     def exit_code(self) -> int:

@@ -9,115 +9,86 @@ from typing import Any
 
 import numpy as np
 
-from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
+from jaxnav.commands.doctor.findings import Finding, found, listed
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.errors import BadInput
 from jaxnav.files.reading import read_mapping
 
 _MAX_ERROR = 0.01  # of a side: a careful tape's error
 _UPRIGHT = 0.3  # the normal's vertical part, below which a marker hangs on a wall
-_TURNED_RAD = np.deg2rad(45)
+_TURNED_DEG = 45
 _MOST_SIZE_M = 2.0
 
 
 def measured_corners(path: Path) -> Iterator[Finding]:
     """Check that measured corners make a flat square of the size that the file says."""
-    checked = 0
-    has_findings = False
-    for index, entry in enumerate(_entries(path)):
-        corners_m, size_m = _numbers(entry.get("corners_world_m")), entry.get("size_m")
-        if corners_m is None or not isinstance(size_m, int | float) or not size_m > 0:
-            continue
-        checked += 1
-        for finding in _square(f"marker {entry.get('id', index)}", corners_m, float(size_m)):
-            has_findings = True
-            yield finding
-    if checked and not has_findings:
-        yield ok(f"corners of {checked} are squares of their size within 1 %")
-
-
-def _entries(path: Path) -> list[dict[str, Any]]:
     try:
         entries = read_mapping(path).get("markers")
     except BadInput:  # the loader reports it
-        return []
-    if not isinstance(entries, list):
-        return []
-    return [entry for entry in entries if isinstance(entry, dict)]
+        return
+    checked, findings = 0, list[Finding]()
+    for index, entry in enumerate(entries if isinstance(entries, list) else []):
+        if not isinstance(entry, dict):
+            continue
+        corners_m, size_m = _corners(entry.get("corners_world_m")), entry.get("size_m")
+        if corners_m is not None and isinstance(size_m, int | float) and size_m > 0:
+            checked += 1
+            findings += _square(f"marker {entry.get('id', index)}", corners_m, float(size_m))
+    yield from findings
+    if checked and not findings:
+        yield found("markers.squares", count=checked)
 
 
-def _numbers(corners: Any) -> np.ndarray | None:
+def _corners(given: Any) -> np.ndarray | None:
     """Corners as an array (4, 3); None where the file holds anything else."""
     try:
-        array = np.array(corners, float)
+        array = np.array(given, float)
     except (TypeError, ValueError):
         return None
     return array if array.shape == (4, 3) and np.isfinite(array).all() else None
 
 
-def _square(name: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding]:
+def _square(marker: str, corners_m: np.ndarray, size_m: float) -> Iterator[Finding]:
     sides_m = np.linalg.norm(np.roll(corners_m, -1, axis=0) - corners_m, axis=1)
     diagonals_m = np.linalg.norm(corners_m[:2] - corners_m[2:], axis=1)
     side_m = float(sides_m.mean())
     if sides_m.max() > 1.2 * sides_m.min() and diagonals_m.min() < 0.9 * sides_m.max():
-        yield error(
-            f"{name}: its corners make a bow tie, two of them are swapped",
-            "corners_world_m are top-left, top-right, bottom-right, bottom-left, clockwise as the "
-            "reader sees them",
-        )
+        yield found("markers.bow_tie", marker=marker)
         return
-    if abs(side_m / size_m - 1) > _MAX_ERROR:
-        yield (error if abs(side_m / size_m - 1) > 3 * _MAX_ERROR else warning)(
-            f"{name}: its corners are {side_m:.4f} m apart, size_m says {size_m:.4f} "
-            f"({size_m / side_m - 1:+.1%})",
-            "measure the black square from edge to edge, without the white paper, and its corners",
-        )
-    spread_m = sides_m.max() - sides_m.min()
-    askew_m = abs(diagonals_m[0] - diagonals_m[1])
+    off = abs(side_m / size_m - 1)
+    if off > _MAX_ERROR:
+        level, more = "error" if off > 3 * _MAX_ERROR else None, size_m / side_m - 1
+        yield found("markers.size", level, marker=marker, side_m=side_m, size_m=size_m, off=more)
+    spread_m, askew_m = np.ptp(sides_m), np.ptp(diagonals_m)
     if max(spread_m, askew_m) > 2 * _MAX_ERROR * side_m:
-        yield warning(
-            f"{name}: its sides differ by {spread_m * 1e3:.1f} mm, its diagonals by "
-            f"{askew_m * 1e3:.1f} mm",
-            "measure its corners again, or give T_world_marker",
+        yield found(
+            "markers.askew", marker=marker, sides_mm=spread_m * 1e3, diagonals_mm=askew_m * 1e3
         )
     # The smallest extent of the four corners is the one across their plane.
     off_m = np.linalg.svd(corners_m - corners_m.mean(axis=0))[1][2] / 2
     if off_m > _MAX_ERROR * side_m:
-        yield warning(
-            f"{name}: its corners are {off_m * 1e3:.1f} mm off a plane",
-            "is the paper curled? Glue it onto a board, and measure its corners again",
-        )
+        yield found("markers.bent", marker=marker, off_mm=off_m * 1e3)
 
 
 def placed(markers: MarkerMap) -> Iterator[Finding]:
     """Check where the markers are, which way up, and how large."""
     corners_world_m = np.asarray(markers.corners_world_m)
     Rs_world_marker = np.asarray(markers.Ts_world_marker.as_matrix())[:, :3, :3]
-    has_findings = False
-    for index, marker_id in enumerate(markers.ids):
-        name, size_m = f"marker {marker_id}", float(markers.size_m[index])
-        lowest_m = corners_world_m[index, :, 2].min()
-        x_axis, y_axis, normal = Rs_world_marker[index].T
-        turned_rad = np.arctan2(x_axis[2], y_axis[2])
+    findings = list[Finding]()
+    for marker_id, size, corners_m, R in zip(
+        markers.ids, markers.size_m, corners_world_m, Rs_world_marker, strict=True
+    ):
+        marker, size_m, depth_m = f"marker {marker_id}", float(size), -corners_m[:, 2].min()
+        x_up, y_up, normal_up = R[2]
+        turned_deg = float(np.rad2deg(np.arctan2(x_up, y_up)))
         if size_m > _MOST_SIZE_M:
-            has_findings = True
-            yield warning(f"{name} is {size_m:.3g} m wide", "lengths are in m")
-        if lowest_m < -_MAX_ERROR * size_m:
-            has_findings = True
-            yield warning(
-                f"{name} reaches {-lowest_m:.2f} m below the ground",
-                "z is measured upwards from the floor that the car drives on",
-            )
-        if abs(normal[2]) < _UPRIGHT and abs(turned_rad) > _TURNED_RAD:
-            quarters = round(float(np.rad2deg(turned_rad)) / 90)
-            has_findings = True
-            yield note(
-                f"{name} hangs turned by {90 * quarters} deg: its top-left corner is not the "
-                "upper left one",
-                "if the printed marker stands upright its corners are in the wrong order; "
-                "--frame with a picture of it tells",
-            )
-    if not has_findings:
-        count = len(markers.ids)
+            findings.append(found("markers.huge", marker=marker, size_m=size_m))
+        if depth_m > _MAX_ERROR * size_m:
+            findings.append(found("markers.below", marker=marker, depth_m=depth_m))
+        if abs(normal_up) < _UPRIGHT and abs(turned_deg) > _TURNED_DEG:
+            quarters_deg = 90 * round(turned_deg / 90)
+            findings.append(found("markers.turned", marker=marker, turned_deg=quarters_deg))
+    yield from findings
+    if not findings:
         families = listed(sorted(set(markers.families)))
-        yield ok(f"{count} of {families}, upright or flat, above the ground")
+        yield found("markers.placed", count=len(markers.ids), families=families)

@@ -3,37 +3,37 @@
 Each marker alone tells whether its corners are in the print's order, and whether the car is then
 level: the print is taken as true and the map is tested, its corners tried in every order in which a
 person may have written them down. All markers at once tell whether sizes, places, lenses and
-cameras agree.
+cameras agree, and which single error of the files explains it where they don't.
 """
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-import jax.numpy as jnp
+import jax
+import jaxlie
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Array, Bool, Float, UInt8
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
-from jaxnav.commands.doctor.fits import (
-    SIZE_SIGMA,
-    FileErrors,
-    Sighted,
-    StandingFit,
-    explained,
-    fit,
-    in_words,
-    poses_by_each,
-)
-from jaxnav.commands.doctor.sight import area_px2
-from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
+from jaxnav.calibrate.rig.views import both_poses
+from jaxnav.commands.doctor.findings import Finding, found, listed
+from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.origin import Origin
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.detection import Detections, make_detectors, observe
+from jaxnav.core.pose.observation import MODEL_SIGMA_PX
+from jaxnav.detection import CornerLanes, Detections, make_detectors, observe
+from jaxnav.detection.observe import double_area_px2
+from jaxnav.errors import BadInput
 from jaxnav.files import Route
+from jaxnav.files.images import read_image
+from jaxnav.files.poses import transform
 
-_MOST_MARKERS = 6  # the largest ones, which are compared
 _LEAST_PX = 12.0  # width of a marker that is found
 # Corner i of the map is corner order[i] of the print: orders that are turned, and orders that count
 # the other way round, as seen from behind.
@@ -45,12 +45,41 @@ _STANDS_DEG = 15.0
 _MOST_HEIGHT_M, _MOST_TILT_DEG = 0.03, 2.0  # errors of tape and floor
 _MAX_WORSE = 40.0  # of chi-square, by which the mirror image of a pose may explain corners worse
 _MAX_ERROR = 3.0  # times the RMS that the corners' sigma allows
-_POSE_NUMBERS = 6
-
 _FITS = 2.0  # chi-square for each number, up to which all is well
 _SMALL_PX = 0.3  # an RMS this small is no error of a file either
 _LEAST_SIZE = 0.03  # a smaller error of a size is not reported
 _CLEARLY = 2.0  # sigma
+# Prior sigmas of a pose, m and rad: anywhere in space, or on a floor that is nearly level, with a
+# tape's errors in the cameras' places.
+ANYWHERE = (10.0, 10.0, 10.0, 3.0, 3.0, 3.0)
+LEVEL = (10.0, 10.0, 0.01, np.deg2rad(0.5), np.deg2rad(0.5), 3.0)
+_SCALE_SIGMA = 0.3  # of the logarithm of a true over a written size or focal length
+_ASIDE, _TURNS_DEG = 0.2, 10.0  # the most of its shift that a wrong size explains
+_MOST_WAYS = 3  # that explain a contradiction and are named
+_MOST_STARTS = 4  # of many markers, whose poses a search begins at
+
+
+def pictures(
+    frames: Mapping[str, str],
+    rig: CameraRig | None,
+    markers: MarkerMap | None,
+    route: Route | None,
+) -> Iterator[Finding]:
+    """Read pictures of one standing car, by the names of their cameras, and examine them.
+
+    Raises:
+        BadInput: a picture can't be read, or is of a camera that the rig does not have.
+    """
+    if rig is None or markers is None:
+        yield found("picture.skipped")
+        return
+    images = {}
+    for name, path in frames.items():
+        if name not in rig.names:
+            problem = f"the rig has no camera {name!r}: expected one of {', '.join(rig.names)}"
+            raise BadInput(f"--frame {name}={path}", problem)
+        images[name] = read_image(Path(path))
+    yield from examine_pictures(rig, markers, route, images)
 
 
 def examine_pictures(
@@ -64,52 +93,41 @@ def examine_pictures(
     Args:
         images: by the names of their cameras.
     """
-    wrong = list(usable(rig, images))
+    wrong = list(_other_sizes(rig, images))
     yield from wrong
     if wrong:
         return
-    detections = _detections(rig, markers, images)
-    yield from identities(rig, markers, detections)
-    seen = Sighted.of(rig, markers, observe(detections, markers), _MOST_MARKERS)
-    if not seen.visible.any():
-        return
-    seen, poses, findings = in_their_order(seen, route)
-    yield from findings
-    yield from together(seen, poses, route)
-
-
-def usable(
-    rig: CameraRig, images: Mapping[str, UInt8[np.ndarray, "rows columns ..."]]
-) -> Iterator[Finding]:
-    """Report pictures of another size than their camera was calibrated at."""
-    for name, image in images.items():
-        width_px, height_px = rig.image_sizes_px[rig.names.index(name)]
-        if image.shape[:2] != (height_px, width_px):
-            yield error(
-                f"{name}: {image.shape[1]} x {image.shape[0]} px, the rig says "
-                f"{width_px} x {height_px}",
-                "take it at the size that the camera was calibrated at",
-            )
-
-
-def _detections(
-    rig: CameraRig, markers: MarkerMap, images: Mapping[str, np.ndarray]
-) -> list[Detections]:
-    """Detections of the map's families for each camera; none where it has no picture."""
     detectors = make_detectors(markers)
-    return [
+    detections = [
         Detections.concatenate(
-            [
-                detector.detect(images[name], rig.camera(index))
-                for detector in detectors
-                if name in images
-            ]
+            [detector.detect(images[name], rig.camera(index)) for detector in detectors]
+            if name in images
+            else []
         )
         for index, name in enumerate(rig.names)
     ]
+    yield from _identities(rig, markers, detections)
+    seen = Sighted(rig, markers, observe(detections, markers))
+    if not seen.ids:
+        return
+    seen, poses, findings = in_their_order(seen, route)
+    yield from findings
+    yield from _together(seen, poses, route)
 
 
-def identities(
+def _other_sizes(rig: CameraRig, images: Mapping[str, np.ndarray]) -> Iterator[Finding]:
+    """Report pictures of another size than their camera was calibrated at."""
+    for name, image in images.items():
+        size_px = rig.image_sizes_px[rig.names.index(name)]
+        if image.shape[1::-1] != size_px:
+            height, width = image.shape[:2]
+            yield found(
+                "picture.size", camera=name, width=width, height=height,
+                rig_width=size_px[0], rig_height=size_px[1],
+            )  # fmt: skip
+
+
+def _identities(
     rig: CameraRig, markers: MarkerMap, detections: Sequence[Detections]
 ) -> Iterator[Finding]:
     """Report which markers are in view, of the map and others."""
@@ -117,37 +135,174 @@ def identities(
     for name, one in zip(rig.names, detections, strict=True):
         keys = list(zip(one.ids.tolist(), one.families, strict=True))
         counts = Counter(keys)
-        for key, corners_px in zip(keys, one.corners_px, strict=True):
+        sides_px = np.sqrt(np.abs(double_area_px2(one.corners_px)) / 2)
+        for key, side_px in zip(keys, sides_px, strict=True):
             if markers.index(*key) is None:
                 foreign.append(f"{key[0]} of {key[1]} in {name}")
             elif counts[key] > 1:
                 twice.append(f"{key[0]} in {name}")
             else:
-                known.append(f"{key[0]} in {name} ({np.sqrt(np.abs(area_px2(corners_px))):.0f} px)")
+                known.append(f"{key[0]} in {name} ({side_px:.0f} px)")
     if foreign:
-        yield note(
-            f"markers that are not in the map: {listed(foreign)}",
-            "add them to the map, or check the ids that are written there",
-        )
+        yield found("picture.foreign", seen=listed(foreign))
     if twice:
-        yield warning(
-            f"seen twice in one picture: {listed(sorted(set(twice)))}",
-            "each marker may hang in one place only: print another id; a mirror shows copies too",
-        )
+        yield found("picture.twice", seen=listed(sorted(set(twice))))
     if known:
-        yield ok(f"markers of the map: {listed(known)}")
+        yield found("picture.seen", seen=listed(known))
     else:
-        yield warning(
-            f"no marker of the map ({listed(markers.ids)} of "
-            f"{listed(sorted(set(markers.families)))}) is found",
-            "wrong id or family in the map? Too small, too dark, blurred, or without a white "
-            f"margin? It should be {_LEAST_PX:.0f} px wide and more",
-        )
+        families = listed(sorted(set(markers.families)))
+        yield found("picture.none", ids=listed(markers.ids), families=families, least_px=_LEAST_PX)
 
 
-def in_their_order(
-    seen: Sighted, route: Route | None
-) -> tuple[Sighted, list[StandingFit], list[Finding]]:
+@dataclass(frozen=True)
+class Sighted:
+    """What the cameras of a standing car see of the markers."""
+
+    rig: CameraRig
+    markers: MarkerMap
+    lanes: CornerLanes
+
+    def where(self, mask: Bool[np.ndarray, "C M"] | np.ndarray) -> "Sighted":
+        """These sightings with only some of them in view."""
+        return replace(self, lanes=self.lanes._replace(visible=self.lanes.visible & mask))
+
+    def only(self, marker: int) -> "Sighted":
+        """These sightings with only one marker in view."""
+        return self.where(np.arange(len(self.markers.ids)) == marker)
+
+    def reordered(self, marker: int, order: tuple[int, ...]) -> "Sighted":
+        """These sightings with the corners of one marker in another order."""
+        corners_px, sigma_px = self.lanes.corners_px.copy(), self.lanes.sigma_px.copy()
+        corners_px[:, marker] = corners_px[:, marker, order]
+        sigma_px[:, marker] = sigma_px[:, marker, order]
+        return replace(self, lanes=self.lanes._replace(corners_px=corners_px, sigma_px=sigma_px))
+
+    @property
+    def ids(self) -> dict[int, str]:
+        """The names of the markers in view, by their place in the map."""
+        seen = np.flatnonzero(self.lanes.visible.any(axis=0)).tolist()
+        return {index: f"marker {self.markers.ids[index]}" for index in seen}
+
+    @property
+    def numbers(self) -> int:
+        """The number of corner coordinates."""
+        return 8 * int(self.lanes.visible.sum())
+
+    @property
+    def sigma_px(self) -> Float[np.ndarray, "N 4"]:
+        """Of the corners in view along an axis, of detection and calibration together."""
+        return np.hypot(self.lanes.sigma_px[self.lanes.visible], MODEL_SIGMA_PX)
+
+    @property
+    def allowed_px(self) -> float:
+        """RMS of the corners' sigmas, px."""
+        return float(np.sqrt(np.mean(self.sigma_px**2)))
+
+    def poses(self) -> Float[np.ndarray, "P 4 4"]:
+        """Both T_world_vehicle by each marker in each camera."""
+        camera, marker = np.nonzero(self.lanes.visible)
+        rays = np.asarray(_rays(self.rig.cameras, self.lanes.corners_px))[camera, marker]
+        Ts_camera_marker = both_poses(rays, np.asarray(self.markers.size_m, float)[marker])
+        Ts_world_marker = np.asarray(self.markers.Ts_world_marker.as_matrix(), float)[marker]
+        Ts_camera_vehicle = np.asarray(self.rig.Ts_camera_vehicle.as_matrix(), float)[camera]
+        T = Ts_world_marker[:, None] @ inverted(Ts_camera_marker) @ Ts_camera_vehicle[:, None]
+        return T[np.isfinite(T).all(axis=(2, 3))]
+
+
+@jax.jit
+def _rays(cameras: Camera, corners_px: Float[Array, "C M 4 2"]) -> Float[Array, "C M 4 3"]:
+    return jax.vmap(lambda camera, pixels: camera.unproject(pixels))(cameras, corners_px)
+
+
+@jax.jit
+def _projected_px(
+    rig: CameraRig, markers: MarkerMap, T_world_vehicle: Float[Array, "4 4"]
+) -> Float[Array, "C M 4 2"]:
+    T_vehicle_world = jaxlie.SE3.from_matrix(T_world_vehicle).inverse()
+    return rig.project(T_vehicle_world, markers.corners_world_m)
+
+
+# Rig and markers, of which something is a factor larger.
+Scaled = Callable[[CameraRig, MarkerMap, float], tuple[CameraRig, MarkerMap]]
+
+
+def _larger(rig: CameraRig, markers: MarkerMap, factor: float) -> tuple[CameraRig, MarkerMap]:
+    return rig, replace(markers, size_m=markers.size_m * factor)
+
+
+def _longer(rig: CameraRig, markers: MarkerMap, factor: float) -> tuple[CameraRig, MarkerMap]:
+    return rig.with_focal_px(np.mean(rig.cameras.focal_px) * factor), markers
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The pose that explains the corners best.
+
+    Attributes:
+        cost: chi-square of corners and prior.
+        error_px: RMS error of all corner coordinates.
+        factor: of what is scaled, where something is.
+        covariance: of a shift and a turn of the vehicle in its own frame, and of the logarithm of
+            the factor where there is one.
+    """
+
+    T_world_vehicle: Float[np.ndarray, "4 4"]
+    cost: float
+    error_px: float
+    factor: float
+    covariance: Float[np.ndarray, "n n"]
+
+    @property
+    def planar(self) -> tuple[float, float, float]:
+        """The pose on the ground: x m, y m, psi rad."""
+        T = self.T_world_vehicle
+        return float(T[0, 3]), float(T[1, 3]), float(np.arctan2(T[1, 0], T[0, 0]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """The angle between the vehicle's z axis and the world's, deg."""
+        return float(np.rad2deg(np.arccos(np.clip(self.T_world_vehicle[2, 2], -1, 1))))
+
+
+def fit(
+    seen: Sighted,
+    start: Float[np.ndarray, "4 4"],
+    sigmas: Sequence[float],
+    scaled: Scaled | None = None,
+) -> Fit:
+    """The best pose near a start, and the best factor of what may be scaled.
+
+    Args:
+        start: T_world_vehicle, which the prior is about.
+        sigmas: of the prior: six of the pose, and one of the factor's logarithm.
+    """
+    visible, sigma_px = seen.lanes.visible, seen.sigma_px[..., None]
+
+    def at(u: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+        """The pose, the factor, and the errors in px."""
+        xi = u * sigmas
+        T = start @ transform(Rotation.from_rotvec(xi[3:6]).as_matrix(), xi[:3])
+        files, factor = (seen.rig, seen.markers), math.exp(float(xi[6:].sum()))
+        if scaled:
+            files = scaled(*files, factor)
+        return T, factor, (np.asarray(_projected_px(*files, T)) - seen.lanes.corners_px)[visible]
+
+    def residuals(u: np.ndarray) -> np.ndarray:
+        return np.append(at(u)[2] / sigma_px, u)
+
+    solution = least_squares(residuals, np.zeros(len(sigmas)), method="lm")
+    T, factor, errors_px = at(solution.x)
+    J = np.asarray(solution.jac)
+    return Fit(
+        T,
+        cost=float(2 * solution.cost),
+        error_px=float(np.sqrt(np.mean(errors_px**2))),
+        factor=factor,
+        covariance=np.linalg.inv(J.T @ J) * np.outer(sigmas, sigmas),
+    )
+
+
+def in_their_order(seen: Sighted, route: Route | None) -> tuple[Sighted, list[Fit], list[Finding]]:
     """Find the order of each marker's corners, and the pose of the car by that marker alone.
 
     Args:
@@ -158,49 +313,50 @@ def in_their_order(
         the findings.
     """
     poses, findings = [], []
-    for index in np.flatnonzero(seen.visible.any(axis=0)).tolist():
-        pose, order = _best_order(seen, index, route)
+    for index, marker in seen.ids.items():
+        pose, order = _best_order(seen.only(index), index, route)
         seen = seen.reordered(index, order)
         poses.append(pose)
-        name = f"marker {seen.markers.ids[index]}"
-        if order == TURNED[0]:
-            findings.append(_levelled(name, pose))
+        if order != TURNED[0]:
+            findings.append(_wrong_order(marker, order, pose))
         else:
-            findings.append(_wrong_order(name, order, pose))
-        findings.extend(_square(name, seen.only(index), pose))
+            findings.append(_levelled(marker, pose))
+        alone = seen.only(index)
+        allowed_px = alone.allowed_px * math.sqrt((alone.numbers - 6) / alone.numbers)
+        if pose.error_px > _MAX_ERROR * allowed_px:  # they fit no square at all
+            findings.append(
+                found(
+                    "picture.no_square",
+                    marker=marker,
+                    error_px=pose.error_px,
+                    allowed_px=allowed_px,
+                )
+            )
     return seen, poses, findings
 
 
-def standing(seen: Sighted) -> StandingFit:
+def standing(seen: Sighted) -> Fit:
     """The most level pose, anywhere in space, among those that explain the corners."""
-    anywhere = FileErrors.of_pose(seen, level=False)
-    fits = [fit(seen, [start], anywhere) for start in poses_by_each(seen)]
+    fits = [fit(seen, start, ANYWHERE) for start in seen.poses()]
     least = min(each.cost for each in fits)
     return min(
-        (each for each in fits if each.cost <= least + _MAX_WORSE), key=lambda each: each.tilt_rad
+        (each for each in fits if each.cost <= least + _MAX_WORSE), key=lambda each: each.tilt_deg
     )
 
 
-def _best_order(
-    seen: Sighted, index: int, route: Route | None
-) -> tuple[StandingFit, tuple[int, ...]]:
+def _best_order(alone: Sighted, index: int, route: Route | None) -> tuple[Fit, tuple[int, ...]]:
     """The pose and the corner order that leave the car level; the map's own order where it does."""
-    alone = seen.only(index)
-    behind = route is not None and _is_behind(seen.markers, index, route)
+    behind = route is not None and _is_behind(alone.markers, index, route)
     as_written = standing(alone)
-    if _tilt_deg(as_written) < _FALLEN_DEG and not behind:
+    if as_written.tilt_deg < _FALLEN_DEG and not behind:
         return as_written, TURNED[0]
     # From the car's pose alone, turned and mirrored can't be told apart.
     tried = [
         (standing(alone.reordered(index, order)), order)
         for order in (MIRRORED if behind else TURNED)
     ]
-    pose, order = min(tried, key=lambda pair: pair[0].tilt_rad)
-    return (pose, order) if _tilt_deg(pose) < _STANDS_DEG else (as_written, TURNED[0])
-
-
-def _tilt_deg(pose: StandingFit) -> float:
-    return float(np.rad2deg(pose.tilt_rad))
+    pose, order = min(tried, key=lambda pair: pair[0].tilt_deg)
+    return (pose, order) if pose.tilt_deg < _STANDS_DEG else (as_written, TURNED[0])
 
 
 def _is_behind(markers: MarkerMap, index: int, route: Route) -> bool:
@@ -210,112 +366,145 @@ def _is_behind(markers: MarkerMap, index: int, route: Route) -> bool:
     return bool(np.all((places_m - T[:2, 3]) @ T[:2, 2] < 0))
 
 
-def _wrong_order(name: str, order: tuple[int, ...], pose: StandingFit) -> Finding:
+def _wrong_order(marker: str, order: tuple[int, ...], pose: Fit) -> Finding:
+    how = "counted the wrong way round, as if seen from behind"
+    if order in TURNED:
+        how = f"turned by {90 * order[0]} deg"
     # Entry order.index(j) of the map is corner j of the print.
     right = " ".join(str(order.index(corner) + 1) for corner in range(4))
-    if order in TURNED:
-        problem = f"turned by {90 * order[0]} deg"
-    else:
-        problem = "counted the wrong way round, as if seen from behind"
-    return error(
-        f"{name}: the corners are {problem}: the first one in the map is the printed "
-        f"{_CORNERS[order[0]]}; in the printed order the car stands level "
-        f"(tilt {_tilt_deg(pose):.0f} deg)",
-        f"write its corners_world_m in the order of the present entries {right}; or turn its "
-        "T_world_marker",
+    first = _CORNERS[order[0]]
+    return found(
+        "picture.order", marker=marker, how=how, first=first, tilt_deg=pose.tilt_deg, order=right
     )
 
 
-def _levelled(name: str, pose: StandingFit) -> Finding:
-    R_world_vehicle = pose.T_world_vehicle[:3, :3]
-    height_m, tilt_deg = float(pose.T_world_vehicle[2, 3]), _tilt_deg(pose)
-    variance_m2 = R_world_vehicle[2] @ pose.pose_covariance[:3, :3] @ R_world_vehicle[2]
-    height_sigma_m = float(np.sqrt(variance_m2))
-    tilt_sigma_deg = float(np.rad2deg(np.sqrt(np.trace(pose.pose_covariance[3:5, 3:5]))))
-    text = (
-        f"{name} alone: the car is {height_m * 100:+.1f} cm (+- {height_sigma_m * 100:.1f}) above "
-        f"the ground, tilted by {tilt_deg:.1f} deg (+- {tilt_sigma_deg:.1f})"
-    )
+def _levelled(marker: str, pose: Fit) -> Finding:
+    up = pose.T_world_vehicle[2, :3]
+    height_m, tilt_deg = float(pose.T_world_vehicle[2, 3]), pose.tilt_deg
+    height_sigma_m = math.sqrt(up @ pose.covariance[:3, :3] @ up)
+    tilt_sigma_deg = math.degrees(math.sqrt(np.trace(pose.covariance[3:5, 3:5])))
     high = abs(height_m) > _MOST_HEIGHT_M + 3 * height_sigma_m
+    level = None
     if high or tilt_deg > _MOST_TILT_DEG + 3 * tilt_sigma_deg:
-        return (error if tilt_deg > _FALLEN_DEG else warning)(
-            text,
-            "measure again: the camera's height, elevation_deg and roll_deg; the marker's corners",
-        )
-    return ok(text)
+        level = "error" if tilt_deg > _FALLEN_DEG else "warning"
+    return found(
+        "picture.level",
+        level,
+        marker=marker,
+        height_cm=height_m * 100,
+        height_sigma_cm=height_sigma_m * 100,
+        tilt_deg=tilt_deg,
+        tilt_sigma_deg=tilt_sigma_deg,
+    )
 
 
-def _square(name: str, alone: Sighted, pose: StandingFit) -> Iterator[Finding]:
-    """Warn where the corners fit no square at all."""
-    free = (alone.numbers - _POSE_NUMBERS) / alone.numbers
-    allowed_px = alone.allowed_px * float(np.sqrt(free))
-    if pose.error_px > _MAX_ERROR * allowed_px:
-        yield warning(
-            f"{name}: its corners are {pose.error_px:.2f} px off those of any square, their "
-            f"scatter allows {allowed_px:.2f}",
-            "calibrate the lens again, glue the paper onto a board; several cameras: their places",
-        )
-
-
-def together(seen: Sighted, poses: Sequence[StandingFit], route: Route | None) -> Iterator[Finding]:
+def _together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterator[Finding]:
     """Report where the car stands, and which part of the files contradicts the rest.
 
     Args:
         seen: corners in the order of the print.
         poses: the pose by each marker alone.
     """
-    starts = [_on_ground(pose) for pose in poses]
-    whole = fit(seen, starts, FileErrors.of_pose(seen, level=True))
-    if route is not None:
-        yield _place(whole, route, seen.markers.origin_m)
-    if len(seen.markers.ids) == 1:
-        yield _size_alone(seen, starts)
-        return
-    text = (
-        f"{len(seen.markers.ids)} markers together: corners are {whole.error_px:.2f} px off, "
-        f"their scatter allows {seen.allowed_px:.2f}"
-    )
-    if whole.cost <= _FITS * seen.numbers or whole.error_px < _SMALL_PX:
-        yield ok(text)
-        return
-    best = explained(seen, [*starts, _on_ground(whole)], whole)
-    if not best:
-        yield warning(
-            f"{text}, and no single error explains it",
-            "calibrate the lenses, then measure the cameras' places and the markers' corners again",
-        )
-        return
-    ways = " or ".join(in_words(seen, each)[0] for each in best)
-    yield error(f"{text}; {best[0].fit.error_px:.2f} if {ways}", in_words(seen, best[0])[1])
-
-
-def _on_ground(pose: StandingFit) -> np.ndarray:
-    return np.asarray(T_world_vehicle_from_planar(jnp.asarray(pose.planar, float)).wxyz_xyz)
-
-
-def _place(whole: StandingFit, route: Route, origin_m: Origin) -> Finding:
+    whole = _on_ground(seen, poses)
     x_m, y_m, psi_rad = whole.planar
-    start = route.start_pose
-    apart_m = math.hypot(x_m - start[0], y_m - start[1])
-    turn_deg = math.degrees((psi_rad - start[2] + math.pi) % (2 * math.pi) - math.pi)
-    return ok(
-        f"the car stands at x {origin_m[0] + x_m:.2f} m, y {origin_m[1] + y_m:.2f} m, "
-        f"psi {round(math.degrees(psi_rad))} deg: "
-        f"{apart_m:.2f} m and {round(turn_deg):+d} deg from the route's start"
-    )
-
-
-def _size_alone(seen: Sighted, starts: Sequence[np.ndarray]) -> Finding:
-    """Check the size of a single marker: its height over the camera tells its distance, so size."""
-    size = FileErrors.of_pose(seen, level=True, size=np.full(1, SIZE_SIGMA))
-    standing_fit = fit(seen, starts, size)
-    logarithm, sigma = float(standing_fit.value.size[0]), float(standing_fit.sigma.size[0])
-    factor, written_m = math.exp(logarithm), float(seen.markers.size_m[0])
-    text = f"marker {seen.markers.ids[0]} is {factor:.2f} (+- {sigma:.2f}) of its size in the map"
-    if abs(logarithm) > max(_CLEARLY * sigma, _LEAST_SIZE):
-        return warning(
-            f"{text}, if the camera's height and elevation are right",
-            f"measure its black square: is it {written_m * factor:.4f} m instead of "
-            f"{written_m:.4f}?",
+    if route is not None:
+        start = route.start_pose
+        apart_rad = math.remainder(psi_rad - start[2], 2 * math.pi)
+        yield found(
+            "picture.stands",
+            x_m=seen.markers.origin_m[0] + x_m,
+            y_m=seen.markers.origin_m[1] + y_m,
+            psi_deg=round(math.degrees(psi_rad)),
+            apart_m=math.hypot(x_m - start[0], y_m - start[1]),
+            turn_deg=round(math.degrees(apart_rad)),
         )
-    return ok(text)
+    if len(seen.ids) == 1:
+        yield _size(seen, poses[0])
+        return
+    count, allowed_px = len(seen.ids), seen.allowed_px
+    agree = found("picture.agree", count=count, error_px=whole.error_px, allowed_px=allowed_px)
+    if _fits(seen, whole):
+        yield agree
+        return
+    ways = list(_contradictions(seen, poses))[:_MOST_WAYS]
+    if not ways:
+        yield found("picture.unexplained", together=agree.what)
+        return
+    either = " or ".join(finding.what for finding in ways)
+    yield replace(ways[0], what=f"{agree.what}; all agree if {either}")
+
+
+def _on_ground(seen: Sighted, starts: Sequence[Fit], scaled: Scaled | None = None) -> Fit:
+    """The best level pose."""
+    fits, sigmas = [], (*LEVEL, _SCALE_SIGMA) if scaled else LEVEL
+    for x_m, y_m, psi_rad in (start.planar for start in starts[:_MOST_STARTS]):
+        R = Rotation.from_euler("z", psi_rad).as_matrix()
+        fits.append(fit(seen, transform(R, np.array([x_m, y_m, 0.0])), sigmas, scaled))
+    return min(fits, key=lambda each: each.cost)
+
+
+def _fits(seen: Sighted, pose: Fit) -> bool:
+    return pose.cost <= _FITS * seen.numbers or pose.error_px < _SMALL_PX
+
+
+def _contradictions(seen: Sighted, poses: Sequence[Fit]) -> Iterator[Finding]:
+    """What explains that the markers don't agree: all of them or the lenses are scaled; or the
+    others agree without one marker or camera, which is then so far off. As in `jaxnav calibrate
+    check`, what most agree about is taken as right."""
+    for key, scaled in (("picture.sizes", _larger), ("picture.focal", _longer)):
+        whole = _on_ground(seen, poses, scaled)
+        if _fits(seen, whole):
+            yield found(key, factor=whole.factor)
+    C, M = seen.lanes.visible.shape
+    for index, alone in zip(seen.ids, poses, strict=True):
+        others = seen.where(np.arange(M) != index)
+        rest = _on_ground(others, poses)
+        if not _fits(others, rest):
+            continue
+        T_map = np.asarray(seen.markers.Ts_world_marker.as_matrix(), float)[index]
+        T_found = rest.T_world_vehicle @ inverted(alone.T_world_vehicle) @ T_map
+        shift_m, turn_deg = T_found[:3, 3] - T_map[:3, 3], np.rad2deg(turn_rad(T_found, T_map))
+        camera = int(np.flatnonzero(seen.lanes.visible[:, index])[0])
+        eye_m = (rest.T_world_vehicle @ Ts_vehicle_camera(seen.rig)[camera])[:3, 3]
+        # Of another size, a marker seems to be nearer or farther in the same direction.
+        way_m, found_m = T_map[:3, 3] - eye_m, T_found[:3, 3] - eye_m
+        aside_m = np.linalg.norm(np.cross(way_m, found_m)) / np.linalg.norm(way_m)
+        if aside_m < _ASIDE * np.linalg.norm(shift_m) and turn_deg < _TURNS_DEG:
+            factor = float(np.linalg.norm(way_m) / np.linalg.norm(found_m))
+            yield found("picture.one_size", **_size_figures(seen, index, factor))
+        else:
+            apart_m = np.linalg.norm(shift_m)
+            yield found("picture.moved", marker=seen.ids[index], shift_m=apart_m, turn_deg=turn_deg)
+    used = np.flatnonzero(seen.lanes.visible.any(axis=1)).tolist()
+    for camera in used if len(used) > 1 else ():
+        mine = (np.arange(C) == camera)[:, None]
+        others, own = seen.where(~mine), seen.where(mine)
+        rest, alone = _on_ground(others, poses), standing(own)
+        eyes_m = [
+            (pose.T_world_vehicle @ Ts_vehicle_camera(seen.rig)[camera])[:3, 3]
+            for pose in (rest, alone)
+        ]
+        # One that is turned still knows where it is.
+        turned = np.linalg.norm(eyes_m[0] - eyes_m[1]) < _MOST_HEIGHT_M
+        if turned and _fits(others, rest) and _fits(own, alone):
+            turn_deg = np.rad2deg(turn_rad(alone.T_world_vehicle, rest.T_world_vehicle))
+            yield found("picture.camera", camera=seen.rig.names[camera], turn_deg=turn_deg)
+
+
+def _size(seen: Sighted, alone: Fit) -> Finding:
+    """Check the size of a single marker: its height over the camera tells its distance, so size."""
+    (index,), by = seen.ids, _on_ground(seen, [alone], _larger)
+    sigma = math.sqrt(by.covariance[6, 6])
+    wrong = abs(math.log(by.factor)) > max(_CLEARLY * sigma, _LEAST_SIZE)
+    key = "picture.own_size" if wrong else "picture.right_size"
+    return found(key, sigma=sigma, **_size_figures(seen, index, by.factor))
+
+
+def _size_figures(seen: Sighted, marker: int, factor: float) -> dict[str, Any]:
+    map_m = float(seen.markers.size_m[marker])
+    return {
+        "marker": seen.ids[marker],
+        "factor": factor,
+        "map_m": map_m,
+        "size_m": map_m * factor,
+    }

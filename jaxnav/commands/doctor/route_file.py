@@ -1,17 +1,20 @@
 """Checks of vehicle and route: do they fit each other, and are markers seen along the route?"""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
-from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
-from jaxnav.commands.doctor.sight import PoseViews, views
+from jaxnav.commands.doctor.findings import Finding, found, listed
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase, Vehicle, curvature_per_m
+from jaxnav.detection.observe import double_area_px2
 from jaxnav.files import Route
 
 READABLE_PX = 12.0  # a marker this wide is read in every second picture of a car at rest
@@ -19,12 +22,22 @@ _ALONG = 48  # poses along the route from which views are computed
 _LONG_BLIND_M = 1.0  # farther than this the odometer should not be trusted alone
 _NEAR_M = 0.25  # the car is about that wide
 _HIGH_M = 1.5
-_TOP_SPEED_MPS = (0.1, 5.0)
-_TIME_CONSTANT_S = (0.02, 2.0)
-_WHEELBASE_M = (0.05, 4.0)
-_TURN_RADPS = (0.2, 20.0)
 _LEAST_STEERING_RAD = 0.1
 _LEAST_RADIUS_M = 0.05  # the estimate's own error is about that
+_TOP_SPEED_MPS = (0.1, 5.0)
+# What a small vehicle's figures lie between, and what they mean.
+_LAG = 0.02, 2.0, "it is the time in s until 63 % of a commanded speed is reached"
+_FIGURES = {
+    "speed_time_constant_s": _LAG,
+    "time_constant_s": _LAG,
+    "wheelbase_m": (0.05, 4.0, "it is the distance between the axles in m"),
+    "forward_limit_mps": (*_TOP_SPEED_MPS, "it is the largest speed in m/s that is commanded"),
+    "turn_limit_radps": (
+        0.2,
+        20.0,
+        "it is the largest turn rate in rad/s that is commanded: a turn in a second is 6.28",
+    ),
+}
 
 
 def turning_radius_m(vehicle: Vehicle | TwistBase) -> float:
@@ -36,216 +49,142 @@ def turning_radius_m(vehicle: Vehicle | TwistBase) -> float:
 
 def vehicle_file(vehicle: Vehicle | TwistBase) -> Iterator[Finding]:
     """Check that the figures are those of a small vehicle, in the units that are meant."""
+    findings = list[Finding]()
+    for name, (least, most, meaning) in _FIGURES.items():
+        value = float(getattr(vehicle, name, least))
+        if not least <= value <= most:
+            findings.append(found("vehicle.figure", name=name, value=value, meaning=meaning))
     if isinstance(vehicle, TwistBase):
-        yield from _base_file(vehicle)
-        return
-    top_mps = float(vehicle.throttle_limit * vehicle.speed_per_throttle_mps)
-    limit_rad, wheelbase_m = float(vehicle.steering_limit_rad), float(vehicle.wheelbase_m)
-    lag_s = float(vehicle.speed_time_constant_s)
-    problems = [
-        (
-            not _TOP_SPEED_MPS[0] <= top_mps <= _TOP_SPEED_MPS[1],
-            f"full throttle ({float(vehicle.throttle_limit):.3g}) is {top_mps:.3g} m/s",
-            "time a straight drive at a small throttle: speed_per_throttle_mps is speed / throttle",
-        ),
-        (
-            not _TIME_CONSTANT_S[0] <= lag_s <= _TIME_CONSTANT_S[1],
-            f"speed_time_constant_s is {lag_s:.3g}",
-            "it is the time in s until 63 % of the speed is reached",
-        ),
-        (
-            not _WHEELBASE_M[0] <= wheelbase_m <= _WHEELBASE_M[1],
-            f"wheelbase_m is {wheelbase_m:.3g}",
-            "it is the distance between the axles in m",
-        ),
-        (
-            limit_rad < _LEAST_STEERING_RAD,
-            f"steering_limit_rad is {limit_rad:.3g}, {math.degrees(limit_rad):.2g} deg",
-            "drive a circle at full lock: calib/README.md says how its radius gives the limit",
-        ),
-    ]
-    good = f"{top_mps:.2g} m/s at full throttle, turns within {turning_radius_m(vehicle):.2f} m"
-    yield from _judged(problems, good)
-
-
-def _base_file(base: TwistBase) -> Iterator[Finding]:
-    """The same of a base that is driven by a twist."""
-    top_mps, turn_radps = float(base.forward_limit_mps), float(base.turn_limit_radps)
-    lag_s = float(base.time_constant_s)
-    problems = [
-        (
-            not _TOP_SPEED_MPS[0] <= top_mps <= _TOP_SPEED_MPS[1],
-            f"forward_limit_mps is {top_mps:.3g}",
-            "it is the largest speed in m/s that is commanded",
-        ),
-        (
-            not _TURN_RADPS[0] <= turn_radps <= _TURN_RADPS[1],
-            f"turn_limit_radps is {turn_radps:.3g}",
-            "it is the largest turn rate in rad/s that is commanded: a turn in a second is 6.28",
-        ),
-        (
-            not _TIME_CONSTANT_S[0] <= lag_s <= _TIME_CONSTANT_S[1],
-            f"time_constant_s is {lag_s:.3g}",
-            "it is the time in s until 63 % of a commanded speed is reached",
-        ),
-    ]
-    good = f"{top_mps:.2g} m/s and {math.degrees(turn_radps):.0f} deg/s at most"
-    yield from _judged(problems, good)
-
-
-def _judged(problems: Sequence[tuple[bool, str, str]], good: str) -> Iterator[Finding]:
-    """A warning for each figure that is wrong, with what to do; else what is good."""
-    for wrong, what, do in problems:
-        if wrong:
-            yield warning(what, do)
-    if not any(wrong for wrong, _, _ in problems):
-        yield ok(good)
+        top_mps, turn_radps = float(vehicle.forward_limit_mps), float(vehicle.turn_limit_radps)
+        fine = found("vehicle.base", top_mps=top_mps, turn_degps=math.degrees(turn_radps))
+    else:
+        limit, lock_rad = float(vehicle.throttle_limit), float(vehicle.steering_limit_rad)
+        top_mps = limit * float(vehicle.speed_per_throttle_mps)
+        if not _TOP_SPEED_MPS[0] <= top_mps <= _TOP_SPEED_MPS[1]:
+            findings.append(found("vehicle.throttle", throttle_limit=limit, top_mps=top_mps))
+        if lock_rad < _LEAST_STEERING_RAD:
+            findings.append(found("vehicle.lock", value=lock_rad, degrees=math.degrees(lock_rad)))
+        fine = found("vehicle.car", top_mps=top_mps, turning_radius_m=turning_radius_m(vehicle))
+    yield from findings or [fine]
 
 
 def route_file(route: Route, vehicle: Vehicle | TwistBase, markers: MarkerMap) -> Iterator[Finding]:
     """Check that the waypoints can be driven to, and that no marker stands in the way."""
     poses, length_m = along(route)
     radius_m, turn_m = route.waypoint_radius_m, turning_radius_m(vehicle)
-    places = np.array([route.start_pose[:2], *route.waypoints_m])
-    legs_m = np.linalg.norm(np.diff(places, axis=0), axis=1)
-    good = True
-    for number, pose in enumerate(_arrivals(route)[:-1], 1):
-        leg_m, target = legs_m[number - 1], np.array(route.waypoints_m[number - 1])
-        if leg_m <= radius_m:
-            good = False
-            yield warning(
-                f"waypoint {number} is {leg_m:.2f} m from the place before: reached at once",
-                f"waypoints are apart by more than waypoint_radius_m ({radius_m:g} m)",
-            )
-            continue
+    findings = list[Finding]()
+    arrivals = _arrivals(route)
+    for number, (pose, target) in enumerate(zip(arrivals, arrivals[1:, :2], strict=False), 1):
+        leg_m = float(np.linalg.norm(target - pose[:2]))
         left = np.array([-np.sin(pose[2]), np.cos(pose[2])])
         centers = pose[:2] + turn_m * np.array([left, -left])
-        if np.linalg.norm(target - centers, axis=1).min() < turn_m - radius_m:
-            good = False
-            yield note(
-                f"waypoint {number} lies inside the smallest circle ({turn_m:.2f} m) of a car "
-                "that comes from the place before: it drives straight on first, then a loop",
-                "move the waypoint, or add one that leads there",
-            )
+        if leg_m <= radius_m:
+            findings.append(found("route.reached", number=number, leg_m=leg_m, radius_m=radius_m))
+        elif np.linalg.norm(target - centers, axis=1).min() < turn_m - radius_m:
+            findings.append(found("route.circle", number=number, turn_m=turn_m))
     if radius_m < _LEAST_RADIUS_M:
-        good = False
-        yield warning(
-            f"waypoint_radius_m is {radius_m:g}: the car may pass by and turn round",
-            "0.1 to 0.2 m suits a small car",
-        )
+        findings.append(found("route.radius", radius_m=radius_m))
     if route.leaves_at_m < (turns_m := 2 * turn_m + radius_m):
-        good = False
-        yield warning(
-            f"leave_m is {route.leaves_at_m:g}: a car that turns round stops",
-            f"its smallest circle takes {turns_m:.2f} m",
-        )
+        findings.append(found("route.leaves", leave_m=route.leaves_at_m, turns_m=turns_m))
     centers_world_m = np.asarray(markers.Ts_world_marker.translation())
     apart_m = np.linalg.norm(poses[:, None, :2] - centers_world_m[:, :2], axis=-1)
-    low = centers_world_m[:, 2] > 0.02  # not on the floor, where one may drive over it
-    if low.any() and apart_m[:, low].min() < _NEAR_M:
-        marker = markers.ids[int(np.flatnonzero(low)[apart_m[:, low].min(axis=0).argmin()])]
-        good = False
-        yield warning(
-            f"the route leads past marker {marker} at {apart_m[:, low].min():.2f} m",
-            "the car would hit it: move the waypoints",
+    # One may drive over a marker on the floor.
+    least_m = np.where(centers_world_m[:, 2] > 0.02, apart_m.min(axis=0), np.inf)
+    if least_m.min() < _NEAR_M:
+        marker = markers.ids[int(least_m.argmin())]
+        findings.append(found("route.marker", marker=marker, apart_m=least_m.min()))
+    yield from findings or [
+        found(
+            "route.free",
+            count=len(route.waypoints_m),
+            length_m=length_m,
+            least_m=apart_m.min(),
+            most_m=apart_m.min(axis=1).max(),
         )
-    if good:
-        yield ok(
-            f"{len(route.waypoints_m)} waypoints, {length_m:.1f} m, "
-            f"{apart_m.min():.1f} to {apart_m.min(axis=1).max():.1f} m from the nearest marker"
-        )
+    ]
 
 
 def sight_along(rig: CameraRig, markers: MarkerMap, route: Route) -> Iterator[Finding]:
     """Check which markers are seen, and how large, from start, waypoints and along the route."""
     poses, length_m = along(route)
     arrivals = _arrivals(route)
-    seen = views(rig, markers, np.concatenate([arrivals, poses]))
-    heights_m = np.asarray(markers.Ts_world_marker.translation())[:, 2]
-    apart_m = np.abs(heights_m[:, None] - Ts_vehicle_camera(rig)[:, 2, 3]).min(axis=1)
-    if apart_m.min() > _HIGH_M:
-        yield warning(
-            f"all markers are {apart_m.min():.1f} m and more above or below the cameras",
-            "heights are measured from the floor, in m, in both files",
-        )
-    if not seen.side_px.any():
-        yield _never_seen(seen, markers)
+    Ts_world_marker = np.asarray(markers.Ts_world_marker.as_matrix())
+    centers_world_m, normals_xy = Ts_world_marker[:, :3, 3], Ts_world_marker[:, :2, 2]
+    apart_m = np.abs(centers_world_m[:, 2:] - Ts_vehicle_camera(rig)[:, 2, 3]).min()
+    if apart_m > _HIGH_M:
+        yield found("sight.heights", apart_m=apart_m)
+    looked_from = np.concatenate([arrivals, poses])
+    sides_px, cameras_world_m = _views(rig, markers, looked_from)
+    if not sides_px.any():
+        to_vehicle_m = looked_from[:, None, :2] - centers_world_m[:, :2]
+        behind = np.einsum("pmi,mi->pm", to_vehicle_m, normals_xy) < 0
+        yield found("sight.behind" if behind.all() else "sight.never", ids=listed(markers.ids))
         return
     for number in range(len(arrivals)):
-        yield _from_place(rig, markers, seen, number)
-    readable: np.ndarray = np.any(seen.side_px[len(arrivals) :] >= READABLE_PX, axis=(1, 2))
-    blind_m = _longest(~readable) * length_m / (_ALONG - 1)
+        place = f"waypoint {number}" if number else "the start"
+        camera, marker = np.unravel_index(int(sides_px[number].argmax()), sides_px.shape[1:])
+        side_px = float(sides_px[number, camera, marker])
+        if side_px == 0:
+            yield found("sight.waypoint" if number else "sight.start", place=place)
+            continue
+        range_m = np.linalg.norm(cameras_world_m[number, camera] - centers_world_m[marker])
+        view = (
+            f"{place}: marker {markers.ids[int(marker)]} is {side_px:.0f} px wide in "
+            f"{rig.names[int(camera)]}, at {range_m:.1f} m"
+        )
+        key = "sight.small" if side_px < READABLE_PX else "sight.view"
+        yield found(key, view=view, range_m=range_m * side_px / READABLE_PX)
+    readable: np.ndarray = np.any(sides_px[len(arrivals) :] >= READABLE_PX, axis=(1, 2))
+    runs = "".join("x" if seen else "." for seen in readable).split("x")
+    blind_m = max(map(len, runs)) * length_m / (_ALONG - 1)
     if blind_m > _LONG_BLIND_M:
-        yield warning(
-            f"along {blind_m:.1f} m of the route no marker is {READABLE_PX:.0f} px wide: "
-            "the odometer alone counts",
-            "add a marker there, print it larger, or move the route nearer",
-        )
+        yield found("sight.blind", blind_m=blind_m, least_px=READABLE_PX)
     else:
-        yield ok(f"a readable marker is in view of {readable.mean():.0%} of the route")
+        yield found("sight.along", share=readable.mean())
 
 
-def _never_seen(seen: PoseViews, markers: MarkerMap) -> Finding:
-    if seen.behind.all():
-        return error(
-            "start and route lie behind all markers",
-            "corners_world_m are clockwise as the reader sees them, beginning top-left: are they "
-            "written as seen from behind?",
-        )
-    return error(
-        f"no marker of {listed(markers.ids)} is seen from the start or along the route",
-        "compare heights and directions of cameras and markers",
-    )
+def _views(
+    rig: CameraRig, markers: MarkerMap, poses: Float[np.ndarray, "P 3"]
+) -> tuple[Float[np.ndarray, "P C M"], Float[np.ndarray, "P C 3"]]:
+    """Views of every marker in every camera from planar poses.
+
+    Returns:
+        The side of a square of each marker's area in the image, px, 0 where the marker does not lie
+        in the image whole with its printed side towards the camera; and the cameras' places, m.
+    """
+    corners_px, inside, Ts = jax.device_get(_corners(rig, markers, jnp.asarray(poses, float)))
+    areas_px2 = double_area_px2(corners_px) / 2
+    places_m = np.einsum("pij,cj->pci", Ts, Ts_vehicle_camera(rig)[:, :, 3])[..., :3]
+    return np.sqrt(np.where(inside & (areas_px2 > 0), areas_px2, 0)), places_m
 
 
-def _from_place(rig: CameraRig, markers: MarkerMap, seen: PoseViews, number: int) -> Finding:
-    """Report the best view from the start (number 0) or from a waypoint."""
-    place = "the start" if number == 0 else f"waypoint {number}"
-    sides_px = seen.side_px[number]
-    camera, marker = np.unravel_index(int(sides_px.argmax()), sides_px.shape)
-    side_px, range_m = float(sides_px[camera, marker]), seen.range_m[number, camera, marker]
-    if side_px == 0:
-        return (warning if number == 0 else note)(
-            f"{place}: no marker is in view",
-            "the car knows its place again when it sees one"
-            if number
-            else "turn the car, or add a marker: it can't begin before it has seen one",
-        )
-    text = (
-        f"{place}: marker {markers.ids[int(marker)]} is {side_px:.0f} px wide in "
-        f"{rig.names[int(camera)]}, at {range_m:.1f} m"
-    )
-    if side_px < READABLE_PX:
-        return warning(
-            f"{text}: it can be read from {range_m * side_px / READABLE_PX:.1f} m on",
-            "begin nearer, or print it larger",
-        )
-    return ok(text)
+@jax.jit
+def _corners(
+    rig: CameraRig, markers: MarkerMap, poses: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def one(pose: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        T_world_vehicle = T_world_vehicle_from_planar(pose)
+        T_vehicle_world, corners_m = T_world_vehicle.inverse(), markers.corners_world_m
+        inside = jnp.all(rig.sees(T_vehicle_world, corners_m), axis=-1)
+        return rig.project(T_vehicle_world, corners_m), inside, T_world_vehicle.as_matrix()
+
+    return jax.vmap(one)(poses)
 
 
 def along(route: Route) -> tuple[Float[np.ndarray, "N 3"], float]:
     """Poses (N, 3), evenly along straight lines through start and waypoints, and the length, m."""
-    places = np.array([route.start_pose[:2], *route.waypoints_m], float)
-    legs = np.diff(places, axis=0)
-    ends_m = np.append(0, np.cumsum(np.linalg.norm(legs, axis=1)))
+    arrivals = _arrivals(route)
+    legs_m = np.linalg.norm(np.diff(arrivals[:, :2], axis=0), axis=1)
+    ends_m = np.append(0, np.cumsum(legs_m))
     at_m = np.linspace(0, ends_m[-1], _ALONG)
-    leg = np.clip(np.searchsorted(ends_m, at_m, side="right") - 1, 0, len(legs) - 1)
-    xy = [np.interp(at_m, ends_m, places[:, axis]) for axis in (0, 1)]
-    return np.stack([*xy, np.arctan2(legs[leg, 1], legs[leg, 0])], axis=1), float(ends_m[-1])
+    leg = np.clip(np.searchsorted(ends_m, at_m, side="right"), 1, len(legs_m))
+    xy = [np.interp(at_m, ends_m, arrivals[:, axis]) for axis in (0, 1)]
+    return np.stack([*xy, arrivals[leg, 2]], axis=1), float(ends_m[-1])
 
 
-def _arrivals(route: Route) -> np.ndarray:
-    """Poses (W + 1, 3) of the start, and of each waypoint with the heading of its leg."""
+def _arrivals(route: Route) -> Float[np.ndarray, "W+1 3"]:
+    """Poses of the start, and of each waypoint with the heading of its leg."""
     places = np.array([route.start_pose[:2], *route.waypoints_m], float)
     legs = np.diff(places, axis=0)
     headings = [route.start_pose[2], *np.arctan2(legs[:, 1], legs[:, 0])]
     return np.column_stack([places, headings])
-
-
-def _longest(flags: np.ndarray) -> int:
-    """The length of the longest run of True."""
-    longest = run = 0
-    for flag in flags:
-        run = run + 1 if flag else 0
-        longest = max(longest, run)
-    return longest

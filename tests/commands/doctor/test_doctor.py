@@ -10,7 +10,7 @@ import pytest
 
 from jaxnav import cli
 from jaxnav.commands.doctor import doctor
-from jaxnav.commands.doctor.findings import Finding, Report
+from jaxnav.commands.doctor.findings import LEVELS, TEXTS, Finding, Report
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 
@@ -21,8 +21,8 @@ CHECKS = "jaxnav.commands.doctor"
 def quick(monkeypatch):
     """The settings of the process stay, and the clock is looked at elsewhere."""
     monkeypatch.setattr("jaxnav.commands.process.configure_jax", lambda **kwargs: None)
-    monkeypatch.setattr(f"{CHECKS}.machine.clock", lambda: [Finding("clock", "ok", "ticks")])
-    monkeypatch.setattr(f"{CHECKS}.machine.disk", lambda folder: [Finding("disk", "ok", "turns")])
+    monkeypatch.setattr(f"{CHECKS}.computer.clock", lambda: [Finding("clock", "ok", "ticks")])
+    monkeypatch.setattr(f"{CHECKS}.computer.disk", lambda folder: [Finding("disk", "ok", "turns")])
 
 
 def lines_with(out: str, *words: str) -> list[str]:
@@ -86,7 +86,7 @@ def test_a_check_that_breaks_hides_no_other(capsys, monkeypatch):
         yield Finding("OpenCV", "ok", "half of it is there")
         raise AttributeError("module 'cv2' has no attribute 'x'")
 
-    monkeypatch.setattr(f"{CHECKS}.software.opencv", breaks)
+    monkeypatch.setattr(f"{CHECKS}.computer.opencv", breaks)
     monkeypatch.setitem(sys.modules, f"{CHECKS}.markers_file", None)  # can't be imported
     assert cli.main(["doctor"]) == 1
     out = capsys.readouterr().out
@@ -127,7 +127,7 @@ def test_pictures_are_named_by_their_cameras(capsys, tmp_path):
 def test_plug_ins_get_their_options(capsys, monkeypatch):
     told = []
     monkeypatch.setattr(
-        f"{CHECKS}.plug_ins.plug_ins", lambda report, setup, *names: told.append((setup, names))
+        f"{CHECKS}.plug_ins.examine", lambda report, setup, *names: told.append((setup, names))
     )
     arguments = "--car car:open --cameras eyes:open --option a=1 --option b=x=y"
     assert cli.main(["doctor", *arguments.split()]) == 0
@@ -137,40 +137,19 @@ def test_plug_ins_get_their_options(capsys, monkeypatch):
     assert setup.start_pose[:2] == (2.0, -1.0)
 
 
-def test_whether_the_step_is_compiled_is_looked_up(monkeypatch, tmp_path, capsys):
-    asked = []
-
-    def file(structures, leaves):
-        asked.append("advance_packed" in structures)
-        return "the.step"
-
-    monkeypatch.setattr("jaxnav.files.configuration.step_folder", lambda: tmp_path)
-    monkeypatch.setattr("jaxnav.files.executables._file", file)
-    monkeypatch.setattr(f"{CHECKS}.software.compile_cache", lambda directory, compiled, refused: [
-        Finding("compile cache", "ok", f"compiled: {compiled}")
-    ])  # fmt: skip
-    assert cli.main(["doctor"]) == 0
-    assert lines_with(capsys.readouterr().out, "compiled: False")
-    assert asked == [True]  # the first is missing, so nobody asks for the second
-    (tmp_path / "the.step").write_bytes(b"")
-    assert cli.main(["doctor"]) == 0
-    assert lines_with(capsys.readouterr().out, "compiled: True")
-
-
 def test_the_report():
     shown: list[Finding] = []
     report = Report(shown.append)
     assert (report.exit_code, report.summary()) == (0, "")
     report.examine("a", lambda: [Finding("a", "note", "x"), Finding("a", "warning", "y")])
     assert report.exit_code == 0
-    assert report.read("b", lambda: 3) == 3
 
     def wrong():
         raise BadInput("--flag", "is wrong")
 
     report.add(Finding("c", "error", "broken"))
     assert report.exit_code == 1
-    assert report.read("d", wrong) is None
+    report.examine("d", wrong)
     assert report.exit_code == 2
     assert [finding.what for finding in shown] == ["x", "y", "broken", "--flag: is wrong"]
     assert report.summary() == "2 errors, 1 warning, 1 note"
@@ -178,6 +157,17 @@ def test_the_report():
         str(Finding("a", "error", "x\ny", "z"))
         == "ERROR    a              x y\n" + " " * 9 + "do: z"
     )
+
+
+def test_every_finding_has_its_words_and_something_to_do():
+    sources = "".join(path.read_text() for path in Path(doctor.__file__).parent.glob("*.py"))
+    for name, entries in TEXTS.items():
+        for short, entry in entries.items():
+            (level,) = entry.keys() - {"do"}
+            assert level in LEVELS, f"{name}.{short}"
+            assert "do" in entry or level == "ok", f"{name}.{short}"
+            found_there = f'"{name}.{short}"' in sources or f'{{name}}.{short}"' in sources
+            assert found_there, f"{name}.{short}"
 
 
 def test_the_checks_are_imported_only_when_they_run():

@@ -12,13 +12,13 @@ import yaml
 
 from jaxnav.commands.doctor import rig_file, route_file
 from jaxnav.commands.doctor.markers_file import measured_corners, placed
-from jaxnav.commands.doctor.rig_file import bearings, intrinsics, lenses, places, rotations
+from jaxnav.commands.doctor.rig_file import bearings, lenses, places
 from jaxnav.commands.doctor.route_file import sight_along, turning_radius_m, vehicle_file
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.lenses import MOST_COEFFICIENTS
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.vehicle import Vehicle
-from jaxnav.files import Route, calib_dir, load_route, save_rig
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
+from jaxnav.files import Route, calib_dir, load_route
 from tests.helpers.findings import all_well, the_problem
 from tests.worlds import marker_map, paper_markers, qcar, qcar_rig, upright
 
@@ -48,19 +48,7 @@ def with_lens(**changes) -> CameraRig:
 
 
 def test_the_qcars_rig_is_in_order():
-    assert all_well(rig_file.rig_file(QCAR / "rig.yaml", RIG))
-
-
-def test_matrices_that_were_rounded_are_named(tmp_path):
-    save_rig(tmp_path / "rig.yaml", RIG)
-    assert all_well(rotations(tmp_path / "rig.yaml"))
-    data = yaml.safe_load((tmp_path / "rig.yaml").read_text())
-    T = np.array(RIG.Ts_camera_vehicle.as_matrix()[1])
-    T[:3, :3] *= 1.0004
-    data["cameras"][1]["T_camera_vehicle"] = T.tolist()
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(data))
-    found = the_problem(rotations(tmp_path / "rig.yaml"), "note")
-    assert found.what.startswith("cameras.right.T_camera_vehicle is a rotation but for 0.0008")
+    assert all_well(rig_file.rig_file(RIG))
 
 
 @pytest.mark.parametrize(
@@ -100,7 +88,9 @@ def test_a_copied_camera_is_noticed():
     ],
 )
 def test_lenses_of_other_images(change, level, words):
-    found = the_problem(intrinsics(with_lens(**change)), level)
+    found, *folds = (f for f in lenses(with_lens(**change)) if f.level != "ok")
+    assert found.level == level
+    assert {fold.key for fold in folds} <= {"rig.folds"}  # beyond a half circle it must
     assert words in found.what
     if "middle" in words:
         assert "calibrated at" in found.do
@@ -108,7 +98,9 @@ def test_lenses_of_other_images(change, level, words):
 
 @pytest.mark.parametrize(("k1", "level"), [(-0.13, "warning"), (-0.6, "error")])
 def test_a_lens_that_folds_within_the_image(k1, level):
-    found = the_problem(lenses(with_lens(distortion=[k1, *[0] * (MOST_COEFFICIENTS - 1)])), level)
+    folded = with_lens(distortion=[k1, *[0] * (MOST_COEFFICIENTS - 1)])
+    (found,) = (found for found in lenses(folded) if found.key == "rig.folds")
+    assert found.level == level
     assert found.what.startswith("front: the lens model can be inverted up to")
 
 
@@ -284,3 +276,24 @@ def test_a_waypoint_without_a_view():
     turned = route((1.0, 0.0), start=(0.0, 3.0, 0.0))
     (first, *_) = sight_along(RIG, MARKERS, turned)
     assert (first.level, first.what) == ("warning", "the start: no marker is in view")
+
+
+BASE = TwistBase.create(1.0, 4.0, 0.15)
+
+
+def test_a_small_base_and_its_route_are_in_order():
+    assert all_well(vehicle_file(BASE))
+    assert turning_radius_m(BASE) == 0
+    assert all_well(route_file.route_file(ROUTE, BASE, MARKERS))
+
+
+@pytest.mark.parametrize(
+    ("figures", "words"),
+    [
+        ((100.0, 4.0, 0.15), "forward_limit_mps is 100"),
+        ((1.0, 229.0, 0.15), "turn_limit_radps is 229"),  # degrees
+        ((1.0, 4.0, 150.0), "time_constant_s is 150"),  # milliseconds
+    ],
+)
+def test_figures_of_no_small_base(figures, words):
+    assert words in the_problem(vehicle_file(TwistBase.create(*figures)), "warning").what

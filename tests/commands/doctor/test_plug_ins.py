@@ -8,14 +8,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from jaxnav.commands.doctor import camera_frames
-from jaxnav.commands.doctor import plug_ins as examined
-from jaxnav.commands.doctor.camera_frames import Watched, judge_cameras, skew
+from jaxnav.commands.doctor import cameras, plug_ins
+from jaxnav.commands.doctor.cameras import Watched, judge_cameras, skew
 from jaxnav.commands.doctor.findings import EXIT_UNREADABLE, Report
-from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry, plug_ins
+from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.detection.types import Detections
 from jaxnav.drive.chassis import chassis_of
-from jaxnav.drive.interfaces import Frame, Odometry
+from jaxnav.drive.interfaces import Frame, Odometry, TwistOdometry
 from jaxnav.errors import BadInput
 from tests.helpers.findings import all_well, the_problem
 from tests.helpers.setups import GoodCamera, GoodVehicle, setup_with
@@ -67,17 +67,17 @@ def module(monkeypatch):
     module.Car, module.Eye = Car, Eye
     module.vehicle, module.cameras = open_vehicle, open_cameras
     monkeypatch.setitem(sys.modules, "somebodys", module)
-    monkeypatch.setattr(camera_frames, "WATCH_S", 0.15)
-    monkeypatch.setattr(camera_frames, "_PATIENCE_S", 0.3)
-    monkeypatch.setattr(examined, "_PATIENCE_S", 0.5)
+    monkeypatch.setattr(cameras, "WATCH_S", 0.15)
+    monkeypatch.setattr(cameras, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(plug_ins, "PATIENCE_S", 0.5)
     # A machine that runs tests may be slow; what is too slow is judged in tests without a clock.
     for part, name, value in (
-        (camera_frames, "_SKEW_S", 9.0),
-        (camera_frames, "_LATE_S", 9.0),
-        (camera_frames, "_LEAST_RATE_HZ", 0.0),
-        (examined, "_SLOW_S", 9.0),
-        (examined, "_OLD_S", 9.0),
-        (examined, "_LEAST_RATE_HZ", 0.0),
+        (cameras, "SKEW_S", 9.0),
+        (cameras, "LATE_S", 9.0),
+        (cameras, "LEAST_RATE_HZ", 0.0),
+        (plug_ins, "SLOW_S", 9.0),
+        (plug_ins, "OLD_S", 9.0),
+        (plug_ins, "LEAST_RATE_HZ", 0.0),
     ):
         monkeypatch.setattr(part, name, value)
     return module
@@ -85,7 +85,7 @@ def module(monkeypatch):
 
 def examine(vehicle="somebodys:vehicle", cameras="somebodys:cameras"):
     report = Report(lambda finding: None)
-    plug_ins(report, SETUP, vehicle, cameras)
+    plug_ins.examine(report, SETUP, vehicle, cameras)
     return report
 
 
@@ -230,12 +230,39 @@ def test_odometry_in_order():
         (readings(valid=False), "error", "20 of 20 readings are marked as not valid"),
         (readings() + readings(1, valid=False), "warning", "1 of 21 readings are marked"),
         (readings(speed_mps=float("nan")), "error", "20 of 20 valid readings are no numbers"),
-        (readings(speed_mps=0.7), "warning", "+0.70 m/s, 20 times the very same"),
+        (readings(speed_mps=0.7), "warning", "+0.70 m/s, steering +0.01 rad, 20 times the"),
         (readings(steering_rad=28.0), "warning", "steering reads +28.00 rad, its limit is 0.50"),
     ],
 )
 def test_odometry_that_is_wrong(given, level, words):
     assert words in the_problem(judge_odometry(given, [], CHASSIS), level).what
+
+
+BASE = chassis_of(TwistBase.create(1.0, 4.0, 0.15))
+
+
+def of_base(*values, kind=TwistOdometry):
+    stamps_ns = [BEGIN_NS + PERIOD_NS * n for n in range(20)]
+    return [Reading(kind(stamp_ns, *values), stamp_ns + 5_000_000, 0.001) for stamp_ns in stamps_ns]
+
+
+def test_a_base_at_rest_is_in_order():
+    (found,) = judge_odometry(of_base(0.0, 0.0, 0.01), [], BASE)
+    assert found.level == "ok"
+    assert found.what.endswith("+0.00 m/s ahead, +0.00 to the left, turns +0.01 rad/s")
+
+
+@pytest.mark.parametrize(
+    ("given", "level", "words"),
+    [
+        (of_base(0.0, 0.0, 0.5), "warning", "turns +0.50 rad/s, 20 times the very same"),
+        (of_base(0.0, 0.3, 0.0), "warning", "+0.30 to the left"),
+        (of_base(0.0, 0.0, float("nan")), "error", "20 of 20 valid readings are no numbers"),
+        (of_base(0.0, 0.0, kind=Odometry), "error", "readings are of the kind Odometry"),
+    ],
+)
+def test_a_base_that_reads_what_can_not_be(given, level, words):
+    assert words in the_problem(judge_odometry(given, [], BASE), level).what
 
 
 def test_readings_that_fail_now_and_then():
@@ -296,7 +323,7 @@ def test_cameras_that_look_at_other_times():
 
 
 def test_opening_that_hangs_is_found(module, monkeypatch):
-    monkeypatch.setattr(examined, "_OPENS_WITHIN_S", 0.05)
+    monkeypatch.setattr(plug_ins, "OPENS_WITHIN_S", 0.05)
     module.vehicle = lambda setup: time.sleep(0.3)
     (found,) = examine(cameras=None).findings
     assert found.level == "error"

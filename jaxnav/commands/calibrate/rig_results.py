@@ -1,0 +1,300 @@
+"""Results of `jaxnav calibrate rig`, `markers` and `check`: files, numbers, advice."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxnav.calibrate.rig.calibrate import RigCalibration
+from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
+from jaxnav.commands.calibrate.data import RigData
+from jaxnav.commands.calibrate.report import provenance
+from jaxnav.core.models.camera import LENS_COEFFICIENTS
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.origin import poses_in_world
+from jaxnav.files import save_markers, save_rig, write_tum
+from jaxnav.files.markers import MarkerSigma, marker_map
+from jaxnav.files.poses import pose_from_matrix
+from jaxnav.files.provenance import Calibrated
+from jaxnav.files.rigs import CameraSigma
+
+# Good enough for driving: half a degree moves the car 3 cm sideways at 3 m from a marker.
+_WELL_M, _WELL_DEG = 0.005, 0.2
+_MANY_OUTLIERS = 0.2
+_FEW_SIGHTINGS = 30
+_CELLS = 8
+_LITTLE_SEEN = 0.25  # of a camera's image
+
+
+@dataclass(frozen=True)
+class RigResults:
+    """A calibration of cameras and markers, and the data that it is of.
+
+    Attributes:
+        command: "rig", "markers" or "check".
+    """
+
+    command: str
+    data: RigData
+    calibration: RigCalibration
+
+    @cached_property
+    def calibrated(self) -> Calibrated:
+        """What the files state of where they come from."""
+        views = self.data.views
+        arrays = [views.corners_px, views.frame, views.camera, views.marker, views.size_m]
+        return provenance(self.command, arrays)
+
+    @cached_property
+    def sigmas(self) -> Float[np.ndarray, "C+M 6"]:
+        """Of cameras and markers, m and deg, along and about the axes of the vehicle for cameras
+        and of the world for markers."""
+        of = self.calibration
+        R = np.concatenate([of.Ts_vehicle_camera, of.Ts_world_marker])[:, :3, :3]
+        body = np.arange(len(R))
+        P = of.covariance[: 6 * len(R), : 6 * len(R)].reshape(len(R), 6, len(R), 6)[body, :, body]
+        variances = [
+            np.einsum("bij,bjk,bik->bi", R, P[:, part, part], R)
+            for part in (slice(0, 3), slice(3, 6))
+        ]
+        return np.sqrt(np.maximum(np.concatenate(variances, axis=1), 0)) * np.repeat(
+            [1, np.rad2deg(1)], 3
+        )
+
+    @cached_property
+    def mapped(self) -> list[int]:
+        """The markers that could be linked, by their place in `data.keys`."""
+        return np.flatnonzero(self.calibration.mapped).tolist()
+
+    @property
+    def markers(self) -> MarkerMap:
+        """The map of these."""
+        T = self.calibration.Ts_world_marker
+        return marker_map(
+            np.stack([pose_from_matrix(T[index]) for index in self.mapped]),
+            self.data.views.size_m[self.mapped].tolist(),
+            [self.data.keys[index][1] for index in self.mapped],
+            [self.data.keys[index][0] for index in self.mapped],
+        )
+
+    def save(self, out: Path) -> list[str]:
+        """Write markers.yaml, trajectory.tum and, of `calibrate rig`, rig.yaml; their names.
+
+        Raises:
+            BadInput: a file can't be written.
+        """
+        data, calibration, C = self.data, self.calibration, len(self.data.rig)
+        names = ["markers.yaml", "trajectory.tum"]
+        if self.command == "rig":
+            names.insert(0, "rig.yaml")
+            poses = [pose_from_matrix(T) for T in inverted(calibration.Ts_vehicle_camera)]
+            rig = replace(
+                data.rig,
+                cameras=calibration.cameras,
+                Ts_camera_vehicle=jaxlie.SE3(jnp.asarray(np.stack(poses), float)),
+            )
+            cameras = [self._camera_sigma(camera) for camera in range(C)]
+            save_rig(out / "rig.yaml", rig, self.calibrated, cameras)
+        # The check takes no place as given.
+        given = data.known if data.anchored and self.command != "check" else {}
+        sigmas: list[MarkerSigma | None] = [
+            None if index in given else MarkerSigma(**_placed_sigma(self.sigmas[C + index]))
+            for index in self.mapped
+        ]
+        markers, unseen = self._with_unseen()
+        save_markers(out / "markers.yaml", markers, self.calibrated, sigmas + [None] * unseen)
+        poses = [pose_from_matrix(T) for T in calibration.Ts_world_vehicle]
+        write_tum(out / "trajectory.tum", calibration.views.stamps_ns / 1e9, np.stack(poses))
+        return names
+
+    def _camera_sigma(self, camera: int) -> CameraSigma:
+        if not self.calibration.calibrated[camera]:
+            return CameraSigma()
+        return CameraSigma(**_placed_sigma(self.sigmas[camera]), **self._lens_sigma(camera))
+
+    def _with_unseen(self) -> tuple[MarkerMap, int]:
+        """The found map with the given map's unseen markers added where they are, and how many
+        these are."""
+        found, given = self.markers, self.data.markers
+        if given is None:
+            return found, 0
+        keys = zip(given.families, given.ids, strict=True)
+        unseen = [index for index, key in enumerate(keys) if key not in self.data.keys]
+        poses, others = (
+            np.asarray(poses_in_world(of.Ts_world_marker.wxyz_xyz, of.origin_m))
+            for of in (found, given)
+        )
+        sizes_m = [np.asarray(found.size_m), np.asarray(given.size_m)[unseen]]
+        return marker_map(
+            np.concatenate([poses, others[unseen]]),
+            np.concatenate(sizes_m).tolist(),
+            [*found.ids, *(given.ids[index] for index in unseen)],
+            [*found.families, *(given.families[index] for index in unseen)],
+        ), len(unseen)
+
+    def _lens_sigma(self, camera: int) -> dict[str, list[float]]:
+        """Sigmas of a camera's lens by the fields of `CameraSigma`; empty if it was not refined."""
+        sigma, cameras = self.calibration.lens_sigmas()[camera], self.data.rig.cameras
+        if not sigma.any():
+            return {}
+        count = LENS_COEFFICIENTS[cameras.lenses[int(cameras.lens_index[camera])]]
+        parts = {"focal_px": sigma[:2], "center_px": sigma[2:4], "distortion": sigma[4 : 4 + count]}
+        return {name: part.tolist() for name, part in parts.items()}
+
+    def report(self) -> dict[str, Any]:
+        """The content of report.json."""
+        data, calibration, C = self.data, self.calibration, len(self.data.rig)
+        views, given = calibration.views, Ts_vehicle_camera(data.rig)
+
+        def seen(rows: np.ndarray) -> dict[str, Any]:
+            residuals = calibration.residuals_px[rows]
+            return {
+                "sightings": int(rows.sum()),
+                "outliers": int(np.sum(calibration.weight[rows] < 1)),
+                "reprojection_rms_px": float(np.sqrt(np.mean(residuals**2)))
+                if rows.any()
+                else None,
+            }
+
+        def placed(T: np.ndarray, sigma: np.ndarray) -> dict[str, Any]:
+            turn = Rotation.from_matrix(T[:3, :3]).as_rotvec(degrees=True)
+            return {
+                "position_m": {"value": T[:3, 3], "sigma": sigma[:3]},
+                "rotation_vector_deg": {"value": turn, "sigma": sigma[3:]},
+            }
+
+        def lens(camera: int) -> dict[str, Any]:
+            def of(cameras: Any, name: str, sigma: list[float]) -> np.ndarray:
+                return np.asarray(getattr(cameras, name))[camera][: len(sigma)]
+
+            return {
+                name: {
+                    "value": of(calibration.cameras, name, sigma),
+                    "sigma": sigma,
+                    "given": of(data.rig.cameras, name, sigma),
+                }
+                for name, sigma in self._lens_sigma(camera).items()
+            }
+
+        cameras = {
+            name: {
+                "calibrated": bool(calibration.calibrated[c]),
+                **seen(views.camera == c),
+                "coverage": self._coverage(c),
+                **placed(T, self.sigmas[c]),
+                **lens(c),
+                "from_given": {
+                    "position_m": float(np.linalg.norm((T - given[c])[:3, 3])),
+                    "rotation_deg": float(np.rad2deg(turn_rad(T, given[c]))),
+                },
+            }
+            for c, (name, T) in enumerate(
+                zip(data.rig.names, calibration.Ts_vehicle_camera, strict=True)
+            )
+        }
+        markers = {
+            f"{family} {marker_id}": {
+                "mapped": bool(calibration.mapped[m]),
+                "given": data.anchored and m in data.known,
+                "size_m": float(views.size_m[m]),
+                **seen(views.marker == m),
+            }
+            | (
+                placed(calibration.Ts_world_marker[m], self.sigmas[C + m])
+                if calibration.mapped[m]
+                else {}
+            )
+            for m, (family, marker_id) in enumerate(data.keys)
+        }
+        return self.calibrated.model_dump() | {
+            "frames": views.frames,
+            "sightings": len(views),
+            "outliers": int(np.sum(calibration.weight < 1)),
+            "reprojection_rms_px": calibration.rms_px(),
+            "corner_sigma_px": calibration.sigma_px,
+            "variance_inflation": calibration.inflation,
+            "branches_changed": calibration.turned,
+            "cameras": cameras,
+            "markers": markers,
+            "advice": list(self._advice()),
+        }
+
+    def _coverage(self, camera: int) -> float:
+        views = self.calibration.views
+        seen = views.corners_px[views.camera == camera]
+        return coverage(seen, self.data.rig.image_sizes_px[camera])
+
+    def _advice(self) -> Iterator[str]:
+        """What to record next, and what to check."""
+        data, calibration = self.data, self.calibration
+        for c, name in enumerate(data.rig.names):
+            sigma_m, sigma_deg = self.sigmas[c, :3].max(), self.sigmas[c, 3:].max()
+            if not calibration.calibrated[c]:
+                count = int(np.sum(data.views.camera == c))
+                yield f"{name}: place as given, no link in {count} sightings: turn on the spot"
+                continue
+            if sigma_m > _WELL_M or sigma_deg > _WELL_DEG:
+                yield f"{name}: {1e3 * sigma_m:.0f} mm, {sigma_deg:.2f} deg: show it nearer markers"
+            if (part := self._coverage(c)) < _LITTLE_SEEN:
+                yield f"{name}: markers in {part:.0%} of its image: move them through all of it"
+        for m, (_, marker_id) in enumerate(data.keys):
+            count = int(np.sum(data.views.marker == m))
+            if not calibration.mapped[m]:
+                yield (
+                    f"marker {marker_id}: in no file, no link in {count} sightings: pass it with "
+                    "another marker in view"
+                )
+            elif count < _FEW_SIGHTINGS:
+                yield f"marker {marker_id}: {count} sightings: pass it once more"
+        share = float(np.mean(calibration.weight < 1))
+        if share > _MANY_OUTLIERS:
+            yield f"{share:.0%} outliers: a marker that moved, lenses, cameras out of step?"
+        if calibration.inflation > 1:
+            yield (
+                f"parts disagree {np.sqrt(calibration.inflation):.1f} times beyond noise, sigmas "
+                "are that much larger: calibrate the lenses, or --refine-lenses"
+            )
+
+
+def _placed_sigma(sigma: np.ndarray) -> dict[str, list[float]]:
+    return {"position_m": sigma[:3].tolist(), "rotation_deg": sigma[3:].tolist()}
+
+
+def coverage(corners_px: Float[np.ndarray, "N 4 2"], image_size_px: tuple[int, int]) -> float:
+    """The share of an image's cells, 8 of them across, in which corners were seen."""
+    width, height = image_size_px
+    across, down = _CELLS, max(1, round(_CELLS * height / width))
+    cell = (corners_px.reshape(-1, 2) + 0.5) / [width, height] * [across, down]
+    inside = np.clip(cell.astype(int), 0, [across - 1, down - 1])
+    return len(np.unique(inside, axis=0)) / (across * down)
+
+
+def lines(report: dict[str, Any]) -> Iterator[str]:
+    """The report in a few lines: counts, errors, places of cameras, and advice."""
+    yield (
+        f"{report['frames']} frames, {report['sightings']} sightings "
+        f"({report['outliers']} outliers), reprojection RMS "
+        f"{report['reprojection_rms_px']:.3f} px, corners to {report['corner_sigma_px']:.3f} px"
+    )
+    for name, of in report["cameras"].items():
+        position, sigma_deg = of["position_m"], max(of["rotation_vector_deg"]["sigma"])
+        if not of["calibrated"] or not max(position["sigma"]):
+            yield f"  {name}: {'as given' if of['calibrated'] else 'not calibrated'}"
+            continue
+        where = " ".join(f"{round(value, 4) + 0.0:.4f}" for value in position["value"])
+        off = of["from_given"]
+        yield (
+            f"  {name}: {where} m to {1e3 * max(position['sigma']):.2f} mm, {sigma_deg:.3f} deg; "
+            f"{1e3 * off['position_m']:.1f} mm and {off['rotation_deg']:.2f} deg from the given "
+            "place"
+        )
+    mapped = sum(of["mapped"] for of in report["markers"].values())
+    yield f"  {mapped} of {len(report['markers'])} markers mapped"
+    yield from (f"note: {sentence}" for sentence in report["advice"])
