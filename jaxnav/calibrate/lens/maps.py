@@ -27,15 +27,11 @@ _STEPS = 8  # of Gauss, Newton
 
 @dataclass(frozen=True)
 class ImageMap:
-    """Values over an image in a grid of h x w pixels.
+    """Values over an image in a grid of h x w pixels."""
 
-    Attributes:
-        pixels: (h, w, 2), where the values are.
-        shift_px: (h, w, 2), by which the second lens draws a ray elsewhere; NaN where one of the
-            lenses does not draw it. Of a sigma, along x and y.
-    """
-
-    pixels: Float[np.ndarray, "h w 2"]
+    pixels: Float[np.ndarray, "h w 2"]  # where the values are
+    # by which the second lens draws a ray elsewhere; NaN where one of the lenses does not draw it.
+    # Of a sigma, along x and y.
     shift_px: Float[np.ndarray, "h w 2"]
 
     @property

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxnav.calibrate.rig.calibrate import calibrate_rig
 from jaxnav.calibrate.rig.marker_check import Check, Verdict, checked
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
 from jaxnav.calibrate.rig.vehicle_frame import moved_world
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments import CalibrateCheck as Arguments
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import provenance, summary, write_files

@@ -1,7 +1,7 @@
 """`jaxnav calibrate markers`: find the places of markers with a calibrated rig."""
 
 from jaxnav.calibrate.rig.calibrate import calibrate_rig
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments import CalibrateMarkers as Arguments
 from jaxnav.commands.calibrate.data import read_rig_data
 from jaxnav.commands.calibrate.rig import publish, refuse_wrong_sizes

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import jaxnav
 from jaxnav.calibrate.rig.calibrate import RigCalibration
-from jaxnav.calibrate.rig.pose_arrays import inverted, turn_rad
+from jaxnav.calibrate.rig.views import inverted, turn_rad
 from jaxnav.commands.calibrate.data import RigData
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.core.models.markers import MarkerMap

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import sees_directions, through_lens
 from jaxnav.core.models.rig import CameraRig

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, error, listed, note, ok, warning
 from jaxnav.commands.doctor.sight import PoseViews, views
 from jaxnav.core.models.markers import MarkerMap
