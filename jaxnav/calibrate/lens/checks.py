@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from jaxnav.calibrate.lens import bundle as lens_bundle
 from jaxnav.calibrate.lens.bundle import BoardCorners, LensUnknowns
 from jaxnav.calibrate.lens.fit import LensFit
+from jaxnav.calibrate.lens.maps import ray_slopes
 from jaxnav.core.linalg.schur import reduce
 
 _CELLS_WIDE = 8
@@ -124,27 +125,14 @@ def rim_sigma_px(fit: LensFit) -> float:
     w, h = np.array(fit.views.image_size_px) - 1.0
     part = np.linspace(0, 1, _RIM_POINTS)
     pixels = np.concatenate([[[w * p, 0], [w * p, h], [0, h * p], [w, h * p]] for p in part])
-    drawn_px, J = jax.device_get(
-        _drawn_again(fit.lens, jnp.asarray(fit.parameters), jnp.asarray(pixels))
-    )
-    if np.max(np.abs(drawn_px - pixels)) > 1:
+    J, _, drawn = ray_slopes(fit.lens, fit.parameters, pixels)
+    if not np.all(drawn):
         return np.inf
     radial = np.array([name[0] not in "cp" for name in fit.names], float)
     J = J[..., : len(radial)] * radial
     covariance = fit.covariance[: len(radial), : len(radial)]
     squared = np.einsum("nci,ij,ncj->n", J, covariance, J)
     return float(np.sqrt(np.max(squared))) if np.all(np.isfinite(squared)) else np.inf
-
-
-@partial(jax.jit, static_argnames="lens")
-def _drawn_again(lens: str, parameters: Array, pixels: Array) -> tuple[Array, Array]:
-    """Projections (N, 2) of the pixels' fixed rays, and their Jacobian (N, 2, 9) by the nine."""
-    rays = lens_bundle.camera_of(lens, parameters).unproject(pixels)
-
-    def drawn(parameters: Array) -> Array:
-        return lens_bundle.camera_of(lens, parameters).project(rays)
-
-    return drawn(parameters), jax.jacfwd(drawn)(parameters)
 
 
 def reach(fit: LensFit) -> float:
