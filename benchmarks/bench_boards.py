@@ -64,7 +64,7 @@ def opencv(board: Board, image: np.ndarray, truth_px: np.ndarray) -> tuple:
         return np.ravel(ids), np.reshape(corners, (-1, 2))
     if board.kind == "chessboard":
         flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-        pattern = board.pattern_columns, board.pattern_rows
+        pattern = board.pattern
         found, corners = cv2.findChessboardCornersSB(image, pattern, flags=flags)
         if found:
             return np.arange(len(board.points_board_m)), np.reshape(corners, (-1, 2))
@@ -73,7 +73,7 @@ def opencv(board: Board, image: np.ndarray, truth_px: np.ndarray) -> tuple:
 
 def ours(board: Board, image: np.ndarray, truth_px: np.ndarray) -> tuple:
     del truth_px
-    view = board_detection.find_board(board, image, "")
+    view = board_detection.look_at(board, image, "").view
     return (np.zeros(0, int), np.zeros((0, 2))) if view is None else (view.ids, view.corners_px)
 
 

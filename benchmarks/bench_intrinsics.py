@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.calibrate.lens import bundle as lens_bundle
 from jaxnav.calibrate.lens.bundle import NO_CUT
 from jaxnav.calibrate.lens.fit import LensFit, fit_lens
 from jaxnav.calibrate.lens.simulated_views import grid_points_m, seen_from, simulated_views
 from jaxnav.calibrate.lens.start import board_poses, opencv_calibration
-from jaxnav.calibrate.lens.views import BoardViews
 from jaxnav.core.models.camera import Camera
 from jaxnav.files.configuration import configure
 

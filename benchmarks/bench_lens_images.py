@@ -25,7 +25,7 @@ from mrcal_lens import MISSING, installed, mrcal_lens  # noqa: E402
 from scipy.ndimage import gaussian_filter  # noqa: E402
 
 from jaxnav.calibrate.board.board import Board  # noqa: E402
-from jaxnav.calibrate.lens.images import calibrate_images  # noqa: E402
+from jaxnav.calibrate.lens.intrinsics import calibrate_images  # noqa: E402
 from jaxnav.calibrate.lens.start import opencv_calibration  # noqa: E402
 from jaxnav.core.models.camera import Camera  # noqa: E402
 from jaxnav.files import calib_dir, load_rig  # noqa: E402

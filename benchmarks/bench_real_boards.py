@@ -24,6 +24,7 @@ from mrcal_lens import MISSING, installed, mrcal_lens  # noqa: E402
 
 from jaxnav.calibrate.board.board import Board  # noqa: E402
 from jaxnav.calibrate.board.images import collect_views  # noqa: E402
+from jaxnav.calibrate.board.views import BoardViews  # noqa: E402
 from jaxnav.calibrate.lens import bundle as lens_bundle  # noqa: E402
 from jaxnav.calibrate.lens.intrinsics import LensCalibration, calibrate_lens  # noqa: E402
 from jaxnav.calibrate.lens.maps import (  # noqa: E402
@@ -32,7 +33,6 @@ from jaxnav.calibrate.lens.maps import (  # noqa: E402
     projection_sigma,
 )
 from jaxnav.calibrate.lens.start import board_poses, opencv_calibration  # noqa: E402
-from jaxnav.calibrate.lens.views import BoardViews  # noqa: E402
 from jaxnav.commands.calibrate.board import read_board  # noqa: E402
 from jaxnav.core.models.camera import Camera  # noqa: E402
 from jaxnav.errors import BadInput  # noqa: E402

@@ -59,7 +59,7 @@ def trials(count: int, frames: int) -> None:
     from tqdm import trange
 
     from jaxnav.calibrate.rig.calibrate import calibrate_rig
-    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, turn_rad
+    from jaxnav.calibrate.rig.views import Ts_vehicle_camera, turn_rad
 
     rig, markers = rig_rooms.qcar(), rig_rooms.room()
     path, true = rig_rooms.lemniscate(frames), Ts_vehicle_camera(rig)
@@ -107,8 +107,13 @@ def branches(frames: int) -> None:
     import rig_rooms
 
     from jaxnav.calibrate.rig.calibrate import calibrate_rig
-    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
-    from jaxnav.calibrate.rig.views import both_poses, rays_camera
+    from jaxnav.calibrate.rig.views import (
+        Ts_vehicle_camera,
+        both_poses,
+        inverted,
+        rays_camera,
+        turn_rad,
+    )
 
     rig, path = rig_rooms.qcar(), rig_rooms.lemniscate(frames)
     true = Ts_vehicle_camera(rig)
@@ -147,8 +152,7 @@ def rendered(frames: int) -> None:
     from tqdm import tqdm
 
     from jaxnav.calibrate.rig.calibrate import calibrate_rig
-    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, turn_rad
-    from jaxnav.calibrate.rig.views import RigViews
+    from jaxnav.calibrate.rig.views import RigViews, Ts_vehicle_camera, turn_rad
     from jaxnav.commands.simulate.rendered_world import READOUT_S, SENSOR
     from jaxnav.detection import make_detector
     from jaxnav.files.poses import pose_from_matrix
@@ -223,9 +227,8 @@ def tagslam() -> None:
 
     from jaxnav.calibrate.rig import bundle
     from jaxnav.calibrate.rig.calibrate import calibrate_rig
-    from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
     from jaxnav.calibrate.rig.vehicle_frame import moved_to_places
-    from jaxnav.calibrate.rig.views import RigViews
+    from jaxnav.calibrate.rig.views import RigViews, Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
     from jaxnav.recordings.other.recordings import read_recording
 
     data = Path(os.environ.get("JAXNAV_DATA", ROOT.parent / "shared" / "data")) / "tagslam"
@@ -284,7 +287,7 @@ def _localise(data: Path, Ts_vehicle_camera: np.ndarray, theirs: np.ndarray) -> 
     import jax.numpy as jnp
     import jaxlie
 
-    from jaxnav.calibrate.rig.pose_arrays import inverted, wxyz_xyz
+    from jaxnav.calibrate.rig.views import inverted, wxyz_xyz
     from jaxnav.core.models.rig import CameraRig
     from jaxnav.files import save_rig
     from jaxnav.recordings.other.recordings import read_recording

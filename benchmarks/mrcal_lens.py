@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxnav.calibrate.board.board import Board
-from jaxnav.calibrate.lens.views import BoardViews
+from jaxnav.calibrate.board.views import BoardViews
 
 MISSING = "mrcal is not installed, its columns are left out: apt install mrcal"
 _COMMAND = "mrcal-calibrate-cameras"

@@ -13,8 +13,7 @@ from jaxlie import SE3, SO3
 
 import jaxnav as jn
 from jaxnav.calibrate.rig.calibrate import calibrate_rig
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, matrices, turn_rad
-from jaxnav.calibrate.rig.views import RigViews
+from jaxnav.calibrate.rig.views import RigViews, Ts_vehicle_camera, matrices, turn_rad
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.files import calib_dir
 from jaxnav.sim.sightings import simulate_sightings

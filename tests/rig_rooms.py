@@ -5,8 +5,7 @@ import jaxlie
 import numpy as np
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration
-from jaxnav.calibrate.rig.pose_arrays import inverted
-from jaxnav.calibrate.rig.views import RigViews
+from jaxnav.calibrate.rig.views import RigViews, inverted
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.files import calib_dir, load_rig

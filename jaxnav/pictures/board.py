@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from jaxnav.calibrate.board.pages import MARGIN_MM, RULER_MM, TEXT_MM, centre_mm
-from jaxnav.calibrate.board.sheets import Sheet
+from jaxnav.calibrate.board.sheets import MARGIN_MM, RULER_MM, TEXT_MM, Sheet, centre_mm
 
 _MM_PER_INCH = 25.4
 _RULERS_MM = (100, 50, 20)  # the longest that fits is drawn

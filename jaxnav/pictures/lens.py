@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from jaxnav.calibrate.lens.bundle import padded_corners
 from jaxnav.calibrate.lens.checks import Cells, cells
 from jaxnav.calibrate.lens.intrinsics import LensCalibration
 from jaxnav.calibrate.lens.maps import ImageMap, projection_sigma
@@ -90,8 +89,7 @@ def draw_image_map(axes: Axes, one: ImageMap, title: str) -> None:
 def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> None:
     """Draw the mean residual of every cell, over the corners themselves."""
     fit = calibration.fit
-    corners_px = np.asarray(padded_corners(fit.views).corners_px)[: len(fit.used)][fit.used]
-    axes.plot(*corners_px.T, ".", ms=1.5, color=SKY, alpha=0.6)
+    axes.plot(*fit.used_px.T, ".", ms=1.5, color=SKY, alpha=0.6)
     filled = seen.corners > 0
     length_px = np.linalg.norm(seen.mean_px[filled], axis=-1)
     width, height = fit.views.image_size_px

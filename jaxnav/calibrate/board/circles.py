@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.board.board import Board
 from jaxnav.calibrate.board.places import is_mirrored
-from jaxnav.calibrate.lens.start import pose_from_rays
+from jaxnav.calibrate.board.views import pose_from_rays
 from jaxnav.core.models.camera import Camera
 from jaxnav.detection.types import at_scale
 

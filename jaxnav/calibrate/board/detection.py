@@ -1,10 +1,9 @@
 """Detection of a board in an image: its points to some hundredths of a pixel.
 
-On a charuco board or an aprilgrid, tags are read and each point is predicted from the tags around
-it; on a chessboard, one of OpenCV's finders finds all points at once. From there all three kinds
-are treated alike: `fit_saddles` fits each point, first with straight edges, then with edges that
-bend as the neighbours in their rows and columns show. Points that don't fit their neighbours are
-dropped.
+OpenCV finds what there is: the tags of a charuco board or an aprilgrid, around which each point is
+predicted, or all points of a chessboard at once. From there all three kinds are treated alike:
+`fit_saddles` fits each point, first with straight edges, then with edges that bend as the
+neighbours in their rows and columns show. Points that don't fit their neighbours are dropped.
 """
 
 from dataclasses import dataclass, replace
@@ -19,20 +18,23 @@ from jaxnav.calibrate.board.places import (
     bent_places,
     is_mirrored,
     mapped,
-    no_places,
     predicted_places,
     straight_places,
 )
 from jaxnav.calibrate.board.saddles import EDGE_WIDTH_SIGMAS, Places, Saddles, fit_saddles
-from jaxnav.calibrate.board.tags import as_printed, read_tags
-from jaxnav.calibrate.lens.views import BoardView
+from jaxnav.calibrate.board.views import BoardView
 from jaxnav.core.models.camera import Camera
 from jaxnav.detection import make_detector
+from jaxnav.detection.families import dictionary
 from jaxnav.detection.image_model import PIXEL_VARIANCE_PX2
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.refine import refine_corners
 from jaxnav.detection.types import at_scale, grey
 
+_FEW_TAGS = 0.5  # of the tags: where fewer are read, the image is read again at twice its size
+_MAX_CORRECTION = 0.4  # part of the bits that a family can correct
+_FEWEST_TAGS = 4  # tell how a charuco board is printed
+_OTHER, _MOST_STRAY = 0.5, 2.0  # of the misfit of the other layout; most that one tag counts for
 _GROWTHS = 4  # how often the set of found points is extended by one pitch
 _RADIUS = 0.45  # of a square: radius of the patch around a saddle
 _MIN_RADIUS_PX, _MAX_RADIUS_PX = 3.0, 9.0
@@ -46,28 +48,22 @@ _MAX_STRAY, _MIN_STRAY_PX = 6.0, 0.7
 
 @dataclass(frozen=True)
 class BoardLook:
-    """The result of looking for a board in one image.
+    """The result of looking for a board in one image."""
 
-    Attributes:
-        view: the points found; None if there are too few.
-        foreign_ids: ids seen of the board's family that are not on the board.
-        own_ids: ids seen that are on the board.
-        board: the board as it is printed: a chessboard may be inverse, a charuco board legacy.
-    """
-
-    view: BoardView | None
-    foreign_ids: tuple[int, ...] = ()
-    own_ids: tuple[int, ...] = ()
+    view: BoardView | None  # the points found; None if the board is not seen, or too little of it
+    foreign_ids: tuple[int, ...] = ()  # ids seen of the board's family that are not on the board
+    own_ids: tuple[int, ...] = ()  # ids seen that are on the board
+    # the board as it is printed: a chessboard may be inverse, a charuco board legacy
     board: Board | None = None
 
 
-def find_board(
+def look_at(
     board: Board,
     image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"],
     name: str,
     camera: Camera | None = None,
-) -> BoardView | None:
-    """Find the board's points in an image; None if the board is not seen, or too little of it.
+) -> BoardLook:
+    """Find the board's points in an image, and the ids of its family's markers.
 
     Args:
         board: the board to look for.
@@ -80,16 +76,6 @@ def find_board(
     Raises:
         BadInput: the image has another shape or type.
     """
-    return look_at(board, image, name, camera).view
-
-
-def look_at(
-    board: Board,
-    image: UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"],
-    name: str,
-    camera: Camera | None = None,
-) -> BoardLook:
-    """Do what `find_board` does, and also return the ids of the markers that were seen."""
     levels = grey(image)
     if board.kind == "marker":
         return _look_for_marker(board, levels, name, camera)
@@ -98,20 +84,65 @@ def look_at(
         if centres_px is None:
             return BoardLook(None)
         return BoardLook(BoardView(name, np.arange(len(centres_px)), centres_px))
-    foreign: tuple[int, ...] = ()
-    own: tuple[int, ...] = ()
     if board.kind == "chessboard":
         board, ids, places = _chessboard_places(board, levels)
-    else:
-        tags, corners_px, foreign = read_tags(board, levels)
-        own = tuple(board.tags[place].id for place in tags)
-        board = as_printed(board, tags, corners_px)
-        corners_m = [board.tags[place].corners_board_m for place in tags]
-        known_m, known_px = np.reshape(corners_m, (-1, 2)), corners_px.reshape(-1, 2)
-        ids, places = predicted_places(
-            board, np.arange(len(board.points_board_m)), known_m, known_px
-        )
+        return BoardLook(_view(board, levels, name, ids, places), board=board)
+    tags, corners_px, foreign = _read_tags(board, levels)
+    board = _as_printed(board, tags, corners_px)
+    known_m = _tag_corners_m(board, tags)
+    every = np.arange(len(board.points_board_m))
+    ids, places = predicted_places(board, every, known_m, corners_px.reshape(-1, 2))
+    own = tuple(board.tags[place].id for place in tags)
     return BoardLook(_view(board, levels, name, ids, places), foreign, own, board)
+
+
+def _read_tags(board: Board, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Of the tags seen once, indices (N,) into `Board.tags` and corners (N, 4, 2), px, TL TR BR BL,
+    to a pixel; and the ids that were read, but are not on the board."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters.markerBorderBits = board.border_cells
+    parameters.minMarkerDistanceRate = 0.02
+    parameters.minMarkerPerimeterRate = 0.01
+    parameters.errorCorrectionRate = _MAX_CORRECTION
+    decoder = cv2.aruco.ArucoDetector(dictionary(board.family), parameters)
+    seen: dict[int, np.ndarray] = {}
+    twice: set[int] = set()
+    for scale in (1, 2):
+        if len(seen) < _FEW_TAGS * board.tag_count:
+            scaled, back = at_scale(levels, scale)
+            quads, ids, _ = decoder.detectMarkers(scaled)
+            read = [] if ids is None else np.ravel(ids).tolist()
+            twice |= {marker_id for marker_id in read if read.count(marker_id) > 1}
+            for marker_id, quad in zip(read, quads, strict=True):
+                seen.setdefault(marker_id, back(quad.reshape(4, 2).astype(float)))
+    places = [p for p, tag in enumerate(board.tags) if tag.id in seen and tag.id not in twice]
+    corners = [np.roll(seen[board.tags[p].id], -board.tags[p].turns, axis=0) for p in places]
+    foreign = set(seen) - {tag.id for tag in board.tags}
+    return np.array(places, int), np.reshape(corners, (-1, 4, 2)), tuple(sorted(foreign))
+
+
+def _as_printed(board: Board, places: np.ndarray, corners_px: np.ndarray) -> Board:
+    """The board, or its legacy twin, whichever has its tags where they are seen."""
+    if board.kind != "charuco" or board.rows % 2 or len(places) < _FEWEST_TAGS:
+        return board
+    seen_px = corners_px.reshape(-1, 2)
+    side_px = np.median(np.linalg.norm(np.diff(corners_px, axis=1), axis=2))
+
+    def misfit(one: Board) -> float:
+        """Mean distance of the corners from a smooth picture of the board, in sides of a tag."""
+        x, y = _tag_corners_m(one, places).T / one.width_m
+        smooth = np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=1)
+        off_px = seen_px - smooth @ np.linalg.lstsq(smooth, seen_px)[0]
+        return float(np.mean(np.minimum(np.linalg.norm(off_px, axis=1) / side_px, _MOST_STRAY)))
+
+    twin = replace(board, white_top_left=not board.white_top_left)
+    return twin if misfit(twin) < _OTHER * misfit(board) else board
+
+
+def _tag_corners_m(board: Board, places: np.ndarray) -> np.ndarray:
+    """(4 N, 2), the corners of some tags on the board."""
+    return np.reshape([board.tags[place].corners_board_m for place in places], (-1, 2))
 
 
 def _view(
@@ -137,7 +168,7 @@ def _first_look(
     board: Board, levels: np.ndarray, ids: np.ndarray, places: Places
 ) -> tuple[np.ndarray, Places]:
     """Fit the saddles at the places, then at places predicted from the saddles found."""
-    saddle_ids, there = np.zeros(0, int), no_places(board)[1]
+    found: list[tuple[np.ndarray, Places]] = []
     for _ in range(1 + _GROWTHS):
         if len(ids) == 0:
             break
@@ -145,15 +176,20 @@ def _first_look(
         move_px = max(2.0, _FIRST_MOVE * square_px)
         saddles = fit_saddles(levels, places, _radius_px(places), move_px)
         ids, places, _ = _kept(board, ids, places, saddles)
+        found.append((ids, places))
         if len(ids) == 0:
             break
-        saddle_ids = np.append(saddle_ids, ids)
-        there = Places(*map(np.concatenate, zip(there, places, strict=True)))
-        missing_ids = np.setdiff1d(np.arange(len(board.points_board_m)), saddle_ids)
-        points_m = board.points_board_m[saddle_ids, :2]
-        ids, places = predicted_places(board, missing_ids, points_m, there.points_px)
-    order = np.argsort(saddle_ids, kind="stable")
-    return saddle_ids[order], there.only(order)
+        all_ids = np.concatenate([part for part, _ in found])
+        missing = np.setdiff1d(np.arange(len(board.points_board_m)), all_ids)
+        known_px = np.concatenate([part.points_px for _, part in found])
+        known_m = board.points_board_m[all_ids, :2]
+        ids, places = predicted_places(board, missing, known_m, known_px)
+    if not found:
+        return ids, places
+    ids = np.concatenate([part for part, _ in found])
+    places = Places(*map(np.concatenate, zip(*(part for _, part in found), strict=True)))
+    order = np.argsort(ids, kind="stable")
+    return ids[order], places.only(order)
 
 
 def _radius_px(places: Places) -> float:
@@ -187,13 +223,13 @@ def _chessboard_places(board: Board, levels: np.ndarray) -> tuple[Board, np.ndar
     Its colours say which way round it is. Where they don't, since it looks the same when it is
     turned, any way round will do.
     """
-    corners_px = _opencv_chessboard(levels, (board.pattern_columns, board.pattern_rows))
+    corners_px = _opencv_chessboard(levels, board.pattern)
+    ids = np.arange(0 if corners_px is None else len(board.points_board_m))
     if corners_px is None:
-        return board, *no_places(board)
-    grid = corners_px.reshape(board.pattern_rows, board.pattern_columns, 2)
+        return board, ids, straight_places(board, ids, np.zeros((0, 2)))
+    grid = corners_px.reshape(*board.pattern[::-1], 2)
     if is_mirrored(grid):
         grid = grid[:, ::-1]
-    ids = np.arange(len(board.points_board_m))
     places = straight_places(board, ids, grid.reshape(-1, 2))
     first = fit_saddles(levels, places, _MAX_RADIUS_PX, _MAX_RADIUS_PX)
     if np.sum(np.sign(first.amplitude) * np.where(board.dark_top_left, 1, -1)) < 0:

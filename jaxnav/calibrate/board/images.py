@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ import numpy as np
 
 from jaxnav.calibrate.board.board import Board
 from jaxnav.calibrate.board.detection import BoardLook, look_at
-from jaxnav.calibrate.board.mismatch import what_is_seen
-from jaxnav.calibrate.lens.views import BoardView, BoardViews
+from jaxnav.calibrate.board.views import BoardView, BoardViews
 from jaxnav.core.models.camera import Camera
+from jaxnav.detection.families import LARGEST_FAMILIES, dictionary
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
 from jaxnav.files.images import open_video, read_image
@@ -29,32 +30,22 @@ _MOST_FRAMES = 600  # of one video that are searched
 _THUMBNAIL_PX, _MIN_CHANGE_GREY = (64, 48), 1.5
 _MIN_MOVE_PX = 10.0  # median distance of the board's points from where the last view has them
 _EXAMPLES = 5  # images kept to find out why no board is seen
-
+_MANY = 4  # markers in an image; fewer may be chance
 
 Bar = Callable[..., Iterable[Any]]  # the items that it is given
 
 
 @dataclass(frozen=True)
 class CollectedViews:
-    """The views of a board, and the reasons why other images gave none.
+    """The views of a board, and the reasons why other images gave none."""
 
-    Attributes:
-        views: the input of the calibration.
-        files: all files read, in order, for the hash of the data.
-        duplicates: (name, name of the image that it repeats).
-        unreadable: (name, why it can't be read).
-        without_board: names of images in which the board is not seen.
-        foreign_ids: ids seen often of the board's family that are not on the board.
-        other_pattern: true if a charuco board is seen in the pattern that its file does not say.
-    """
-
-    views: BoardViews
-    files: tuple[Path, ...]
-    duplicates: tuple[tuple[str, str], ...]
-    unreadable: tuple[tuple[str, str], ...]
-    without_board: tuple[str, ...]
-    foreign_ids: tuple[int, ...]
-    other_pattern: bool
+    views: BoardViews  # the input of the calibration
+    files: tuple[Path, ...]  # all files read, in order, for the hash of the data
+    duplicates: tuple[tuple[str, str], ...]  # (name, name of the image that it repeats)
+    unreadable: tuple[tuple[str, str], ...]  # (name, why it can't be read)
+    without_board: tuple[str, ...]  # names of images in which the board is not seen
+    foreign_ids: tuple[int, ...]  # ids seen often of the board's family that are not on the board
+    other_pattern: bool  # true if a charuco board is seen in the pattern that its file does not say
 
 
 def collect_views(
@@ -72,7 +63,7 @@ def collect_views(
         board: the board to look for.
         sources: folders of images, images, videos. The images of a folder are read in the order
             of their names, with numbers compared by value.
-        camera: see `find_board`.
+        camera: see `look_at`.
         bar: shows progress, as `tqdm` does, which it takes the arguments of.
 
     Raises:
@@ -80,14 +71,76 @@ def collect_views(
             board is not seen; the message then says what is seen instead.
     """
     files = source_files(sources)
-    collector = _Collector(board, camera)
-    names = _names(files)
-    for file, name in bar(zip(files, names, strict=True), total=len(files)):
-        if file.suffix.lower() in VIDEOS:
-            collector.add_video(file, name, bar(_frames(file), unit=" frame", leave=False))
-        else:
-            collector.add_image(file, name)
-    return collector.collected(files)
+    views: list[BoardView] = []
+    looks: list[BoardLook] = []
+    duplicates: list[tuple[str, str]] = []
+    unreadable: list[tuple[str, BadInput]] = []
+    without: list[str] = []
+    examples: list[np.ndarray] = []
+    digests: dict[bytes, str] = {}
+    size_px, first = (0, 0), ""
+
+    for file, name in bar(zip(files, _names(files), strict=True), total=len(files)):
+        video = file.suffix.lower() in VIDEOS
+        last_view: BoardView | None = None  # of this video
+        last_thumbnail = np.zeros(0)
+        try:
+            images = _frames(file) if video else [(0, read_image(file, cv2.IMREAD_GRAYSCALE))]
+        except BadInput as error:
+            unreadable.append((name, error))
+            continue
+        for number, image in bar(images, unit=" frame", leave=False) if video else images:
+            shown_px = image.shape[1], image.shape[0]
+            if not first:
+                size_px, first = shown_px, str(file)
+            elif shown_px != size_px:
+                problem = (
+                    f"is {shown_px[0]} x {shown_px[1]} pixels, but {first} is {size_px[0]} x "
+                    f"{size_px[1]}: calibrate one camera at one resolution"
+                )
+                raise BadInput(str(file), problem)
+            if not video:
+                digest = hashlib.sha256(np.ascontiguousarray(image).tobytes()).digest()
+                if digest in digests:
+                    duplicates.append((name, digests[digest]))
+                    continue
+                digests[digest] = name
+            thumbnail = cv2.resize(image, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA)
+            if last_view is not None:
+                if np.mean(cv2.absdiff(thumbnail, last_thumbnail)) < _MIN_CHANGE_GREY:
+                    continue
+            look = look_at(board, image, f"{name}#{number}" if video else name, camera)
+            looks.append(look)
+            if look.view is None:
+                without.append(f"{name}#{number}" if video else name)
+                examples += [image] if len(examples) < _EXAMPLES else []
+            elif _move_px(last_view, look.view) >= _MIN_MOVE_PX:
+                views.append(look.view)
+                if video:
+                    last_view, last_thumbnail = look.view, thumbnail
+
+    if unreadable and not looks:
+        raise unreadable[0][1]
+    often = Counter(i for look in looks for i in look.foreign_ids)
+    # A marker may hang in the room, and texture be read as one; a wrong board brings the same
+    # several into most images.
+    rare = min(max(1, len(looks) / 4), len(looks) - 1)
+    foreign = sorted(i for i, count in often.items() if count > rare)
+    strange = sum(len(set(foreign) & set(look.foreign_ids)) > 1 for look in looks)
+    if strange > len(looks) / 2 or not views:
+        where = files[0] if len(files) == 1 else files[0].parent
+        raise BadInput(where, _what_is_seen(board, looks, examples, foreign))
+    printed = [look.board for look in looks if look.board is not None and look.view]
+    other = sum(one.white_top_left != board.white_top_left for one in printed)
+    return CollectedViews(
+        BoardViews(board.points_board_m, size_px, tuple(views)),
+        files,
+        tuple(duplicates),
+        tuple((name, str(error).partition(": ")[2]) for name, error in unreadable),
+        tuple(without),
+        tuple(foreign),
+        other_pattern=board.kind == "charuco" and other > len(printed) / 2,
+    )
 
 
 def source_files(sources: Sequence[Path]) -> tuple[Path, ...]:
@@ -139,114 +192,8 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
     ]
 
 
-class _Collector:
-    """Collects views image by image and remembers why images gave none."""
-
-    def __init__(self, board: Board, camera: Camera | None):
-        self._board, self._camera = board, camera
-        self._size_px: tuple[int, int] | None = None
-        self._first = ""
-        self._digests: dict[bytes, str] = {}
-        self._views: list[BoardView] = []
-        self._looks: list[BoardLook] = []
-        self._duplicates: list[tuple[str, str]] = []
-        self._unreadable: list[tuple[str, BadInput]] = []
-        self._without: list[str] = []
-        self._examples: list[np.ndarray] = []
-
-    def add_image(self, file: Path, name: str) -> None:
-        try:
-            image = read_image(file, cv2.IMREAD_GRAYSCALE)
-        except BadInput as error:
-            self._unreadable.append((name, error))
-            return
-        self._same_size(str(file), image)
-        if not self._is_repeated(name, image):
-            look = self._look(name, image)
-            if look.view is not None:
-                self._views.append(look.view)
-
-    def add_video(self, file: Path, name: str, frames: Iterable[tuple[int, np.ndarray]]) -> None:
-        last_view: BoardView | None = None
-        last_thumbnail: np.ndarray | None = None
-        for number, image in frames:
-            self._same_size(str(file), image)
-            thumbnail = cv2.resize(image, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(float)
-            if last_thumbnail is not None:
-                if np.mean(np.abs(thumbnail - last_thumbnail)) < _MIN_CHANGE_GREY:
-                    continue
-            view = self._look(f"{name}#{number}", image).view
-            if view is None or _move_px(last_view, view) < _MIN_MOVE_PX:
-                continue
-            self._views.append(view)
-            last_view, last_thumbnail = view, thumbnail
-
-    def collected(self, files: tuple[Path, ...]) -> CollectedViews:
-        if self._unreadable and not self._looks:
-            raise self._unreadable[0][1]
-        often = Counter(i for look in self._looks for i in look.foreign_ids)
-        # A marker may hang in the room, and texture be read as one; a wrong board brings the same
-        # several into most images.
-        looks = len(self._looks)
-        rare = min(max(1, looks / 4), looks - 1)
-        foreign = sorted(i for i, count in often.items() if count > rare)
-        strange = sum(len(set(foreign) & set(look.foreign_ids)) > 1 for look in self._looks)
-        if strange > looks / 2 or not self._views:
-            raise BadInput(
-                files[0] if len(files) == 1 else files[0].parent,
-                what_is_seen(self._board, self._looks, self._examples, foreign),
-            )
-        assert self._size_px is not None
-        return CollectedViews(
-            BoardViews(self._board.points_board_m, self._size_px, tuple(self._views)),
-            files,
-            tuple(self._duplicates),
-            tuple((name, str(error).partition(": ")[2]) for name, error in self._unreadable),
-            tuple(self._without),
-            tuple(foreign),
-            self._has_other_pattern(),
-        )
-
-    def _has_other_pattern(self) -> bool:
-        seen = [look.board for look in self._looks if look.board is not None and look.view]
-        other = sum(board.white_top_left != self._board.white_top_left for board in seen)
-        return self._board.kind == "charuco" and other > len(seen) / 2
-
-    def _look(self, name: str, image: np.ndarray) -> BoardLook:
-        look = look_at(self._board, image, name, self._camera)
-        self._looks.append(look)
-        if look.view is None:
-            self._without.append(name)
-            if len(self._examples) < _EXAMPLES:
-                self._examples.append(image)
-        return look
-
-    def _same_size(self, name: str, image: np.ndarray) -> None:
-        height, width = image.shape
-        if self._size_px is None:
-            self._size_px, self._first = (width, height), name
-        elif (width, height) != self._size_px:
-            raise BadInput(
-                name,
-                f"is {width} x {height} pixels, but {self._first} is {self._size_px[0]} x "
-                f"{self._size_px[1]}: calibrate one camera at one resolution",
-            )
-
-    def _is_repeated(self, name: str, image: np.ndarray) -> bool:
-        digest = hashlib.sha256(np.ascontiguousarray(image).tobytes()).digest()
-        if digest in self._digests:
-            self._duplicates.append((name, self._digests[digest]))
-            return True
-        self._digests[digest] = name
-        return False
-
-
 def _frames(file: Path) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield numbers and grey images (H, W) of a video's frames; every n-th if the video is long.
-
-    Raises:
-        BadInput: OpenCV can't read the file as a video.
-    """
+    """Yield numbers and grey images (H, W) of a video's frames; every n-th if the video is long."""
     capture = open_video(file)
     try:
         if not capture.isOpened():
@@ -278,3 +225,77 @@ def _move_px(before: BoardView | None, now: BoardView) -> float:
         return np.inf
     apart_px = np.linalg.norm(now.corners_px[here] - before.corners_px[then], axis=1)
     return float(np.median(apart_px))
+
+
+def _what_is_seen(
+    board: Board,
+    looks: Sequence[BoardLook],
+    examples: Sequence[np.ndarray],
+    foreign: Sequence[int],
+) -> str:
+    """Say in one line why the board is not found.
+
+    Args:
+        examples: some of the images without the board, (H, W) grey.
+        foreign: ids that are often seen and not on the board.
+    """
+
+    def listed(ids: Sequence[int]) -> str:
+        return ", ".join(map(str, ids[:6])) + ", ..." * (len(ids) > 6)
+
+    own = sorted({marker_id for look in looks for marker_id in look.own_ids})
+    if foreign:
+        return (
+            f"markers {listed(foreign)} of {board.family} are seen, which are not on the "
+            f"{board}: describe the board that is in the images"
+        )
+    if len(own) >= _MANY:
+        return (
+            f"markers {listed(own)} are seen, but not arranged as on the {board}: check its kind, "
+            "columns and rows"
+        )
+    whole = ""
+    if board.kind == "chessboard" or board.has_discs:
+        whole = f" All of a {'chessboard' if not board.has_discs else 'grid'} must be in the image."
+    if board.kind == "chessboard":
+        other = _largest_chessboard(examples)
+        if other is not None and sorted(other) != sorted((board.columns, board.rows)):
+            return (
+                f"shows a chessboard of {other[0]} x {other[1]} squares, not the {board}: count "
+                "the squares, not the corners between them"
+            )
+    elif not board.has_discs and (code := _other_code(examples)) is not None:
+        return f"shows {code}, not the {board}: describe the board that is in the images"
+    images = f"{len(looks)} image{'s' * (len(looks) != 1)}"
+    return (
+        f"no {board} is found in {images}: is it the right board, sharp, with white around it, and "
+        f"at least some 20 px a square?{whole}"
+    )
+
+
+def _largest_chessboard(examples: Sequence[np.ndarray]) -> tuple[int, int] | None:
+    """Columns and rows, in squares, of the largest chessboard in the images."""
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    shapes = []
+    for image in examples:
+        success, _, meta = cv2.findChessboardCornersSBWithMeta(image, (3, 3), flags)
+        if success:
+            rows, columns = np.shape(meta)
+            shapes.append((columns + 1, rows + 1))
+    return max(shapes, key=lambda shape: (shape[0] - 1) * (shape[1] - 1), default=None)
+
+
+def _other_code(examples: Sequence[np.ndarray]) -> str | None:
+    """Name in words the marker family that the images show instead."""
+    most, named = _MANY - 1, None
+    for family, border in product(LARGEST_FAMILIES, (1, 2)):
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits = border
+        parameters.errorCorrectionRate = 0.0
+        decoder = cv2.aruco.ArucoDetector(dictionary(family), parameters)
+        for image in examples:
+            _, ids, _ = decoder.detectMarkers(image)
+            if ids is not None and len(ids) > most:
+                most = len(ids)
+                named = f"markers of {family} with a frame of {border} cell{'s' * (border > 1)}"
+    return named

@@ -18,11 +18,6 @@ _SPREAD = 2.0  # most pitches by which the other known points are further away
 _LONGEST_REACH = 3.6  # most pitches to a neighbour in a row or column
 
 
-def no_places(board: Board) -> tuple[Int[np.ndarray, " found"], Places]:
-    """No ids and no places."""
-    return np.zeros(0, int), _places(board, np.zeros((0, 2)), np.zeros((0, 2, 2)))
-
-
 def predicted_places(
     board: Board,
     wanted: Int[np.ndarray, " W"],
@@ -31,23 +26,23 @@ def predicted_places(
 ) -> tuple[Int[np.ndarray, " found"], Places]:
     """Ids and places of the wanted points (W,), each by the homography of the known points (N, 2)
     near it; points without enough known ones near are left out."""
-    ids, points_px, along_px = [], [], []
+    ids: list[int] = []
+    seen: list[np.ndarray] = []
     steps = np.array([[0, 0], [1, 0], [-1, 0], [0, -1], [0, 1]]) / 4
     for point_id in wanted:
         offset = (known_m - board.points_board_m[point_id, :2]) / board.pitch_m
         distance = np.linalg.norm(offset, axis=1)
         around = np.argsort(distance, kind="stable")[:_KNOWN_AROUND]
+        around = around[distance[around] <= min(distance, default=np.inf) + _SPREAD]
         if len(around) < 4 or distance[around[0]] > _NEAREST_KNOWN:
             continue
-        around = around[distance[around] <= distance[around[0]] + _SPREAD]
-        seen = mapped(offset[around], known_px[around], steps) if len(around) >= 4 else None
-        if seen is not None:
-            ids.append(point_id)
-            points_px.append(seen[0])
-            along_px.append([2 * (seen[1] - seen[2]), 2 * (seen[3] - seen[4])])
-    if not ids:
-        return no_places(board)
-    return np.array(ids), _places(board, np.array(points_px), np.array(along_px))
+        at = mapped(offset[around], known_px[around], steps)
+        if at is not None:
+            ids.append(int(point_id))
+            seen.append(at)
+    px = np.array(seen).reshape(-1, 5, 2)
+    along_px = 2 * np.stack([px[:, 1] - px[:, 2], px[:, 3] - px[:, 4]], axis=1)
+    return np.array(ids, int), _places(board, px[:, 0], along_px)
 
 
 def straight_places(
@@ -102,30 +97,27 @@ def _steps_and_bends(
     the third, where these are on one side, as at the board's border. NaN where a point has no
     neighbour. With one neighbour there is a step, but no bend.
     """
-    columns, rows = board.grid[ids].T
-    table = np.full((2, board.pattern_rows, board.pattern_columns), np.nan)
-    table[:, rows, columns] = points_px.T
-    places_m = np.full((2, board.pattern_rows, board.pattern_columns), np.nan)
-    places_m[:, board.grid[:, 1], board.grid[:, 0]] = board.points_board_m[:, :2].T * [[1], [-1]]
-    places = places_m / board.pitch_m
+    # What is seen of the grid of points, and where on the board that is, in pitches.
+    seen_px = np.full((*board.pattern, 2), np.nan)
+    seen_px[tuple(board.grid[ids].T)] = points_px
+    at = np.full((*board.pattern, 2), np.nan)
+    at[tuple(board.grid.T)] = board.points_board_m[:, :2] * [1, -1] / board.pitch_m
     steps, bends = np.full((len(ids), 2, 2), np.nan), np.full((len(ids), 2), np.nan)
-    for index, (column, row) in enumerate(zip(columns, rows, strict=True)):
-        for axis in (0, 1):
-            line = table[:, row, :] if axis == 0 else table[:, :, column]
-            at = places[0, row, :] if axis == 0 else places[1, :, column]
-            own = column if axis == 0 else row
-            seen = np.flatnonzero(np.isfinite(line[0]) & (np.arange(len(at)) != own))
-            seen = seen[np.abs(at[seen] - at[own]) < _LONGEST_REACH]
-            seen = seen[np.argsort(np.abs(at[seen] - at[own]), kind="stable")[:3]]
-            t = at[seen] - at[own]
-            if len(seen) == 0:
+    for index, (column, row) in enumerate(board.grid[ids]):
+        for axis, own in ((0, column), (1, row)):
+            cut = (slice(None), row) if axis == 0 else (column, slice(None))
+            line_px, t = seen_px[cut], at[cut][:, axis] - at[column, row, axis]
+            near = np.isfinite(line_px[:, 0]) & (np.abs(t) < _LONGEST_REACH)
+            near[own] = False
+            order = np.argsort(np.where(near, np.abs(t), np.inf), kind="stable")[: near.sum()][:3]
+            if len(order) == 3 and t[order[0]] * t[order[1]] < 0:
+                order = order[:2]
+            if not len(order):
                 continue
-            if len(seen) == 3 and t[0] * t[1] < 0:
-                seen, t = seen[:2], t[:2]
-            powers = t[:, None] ** np.arange(1, len(t) + 1)
-            curve = np.linalg.solve(powers, (line[:, seen].T - line[:, own]))
+            powers = t[order, None] ** np.arange(1, len(order) + 1)
+            curve = np.linalg.solve(powers, line_px[order] - line_px[own])
             steps[index, axis] = curve[0]
-            if len(seen) > 1:
+            if len(order) > 1:
                 u, v = curve[0] / np.linalg.norm(curve[0])
                 bends[index, axis] = curve[1, 1] * u - curve[1, 0] * v
     return steps, bends

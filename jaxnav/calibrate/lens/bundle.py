@@ -16,12 +16,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxnav.calibrate.lens.views import BoardViews
-from jaxnav.calibrate.rig.pose_arrays import retracted
+from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.core.linalg.levenberg_marquardt import LMState
 from jaxnav.core.linalg.schur import Blocks, SchurLM, reduce
 from jaxnav.core.models.camera import Camera
-from jaxnav.core.models.geometry import rotation_matrix, skew, turn_and_shift
+from jaxnav.core.models.geometry import cayley, rotation_matrix, skew, turn_and_shift
 from jaxnav.core.models.lenses import LENSES, MOST_COEFFICIENTS
 
 # Names of the shared unknowns, in order; unknowns that a lens doesn't have are fixed at zero.
@@ -70,6 +69,12 @@ def camera_of(lens: str, parameters: Float[Array, " 9"]) -> Camera:
     """The camera with these nine parameters."""
     coefficients = jnp.pad(parameters[4:], (0, MOST_COEFFICIENTS + 4 - COUNT))
     return Camera(parameters[:2], parameters[2:4], coefficients, jnp.asarray(0), (lens,))
+
+
+@jax.vmap
+def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Array, " 7"]:
+    """Move poses (n, 7) by twists (n, 6): T * cay(xi)."""
+    return (jaxlie.SE3(wxyz_xyz) @ cayley(xi)).normalize().wxyz_xyz
 
 
 @partial(jax.jit, static_argnames="lens")

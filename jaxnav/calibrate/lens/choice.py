@@ -1,19 +1,33 @@
-"""Choice of the views that tell most about the lens.
+"""Choice of the views that tell most about a lens, and of the lens that explains most of them.
 
-Source: Fedorov (1972), "Theory of optimal experiments": greedy D-optimality, each view chosen
-raises the determinant of the information most.
+Views are chosen greedily: each raises the determinant of the information most. Lenses are compared
+by cross-validation: every one is fitted to three quarters of the views and has to explain the last
+quarter, where only the poses are then free; four times, so that each view is left out once.
+
+Source: Fedorov (1972), "Theory of optimal experiments"; Stone (1974), "Cross-validatory choice and
+assessment of statistical predictions".
 """
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.calibrate.lens import bundle as lens_bundle
+from jaxnav.calibrate.lens.bundle import COUNT, LensUnknowns
+from jaxnav.calibrate.lens.fit import LensFit
 from jaxnav.calibrate.lens.start import board_poses
-from jaxnav.calibrate.lens.views import BoardViews
 
+FEWEST_VIEWS = 8  # to compare lenses by
 _WRONG = 10.0  # times the median view's error: a view beyond it tells nothing about the lens
 _NO_CURVE = 1e-9  # of the total information, so that the first views have a determinant
+_FOLDS = 4
+_WORSE = 1.02  # times radtan's error: no coefficients at all may be this much worse
+_FEW_WORSE = 1.5  # times another lens's residuals: of few views radtan is not taken
+_CLEARLY = 1.05, 3.0  # times the error, and standard errors of the difference
 
 
 def informative(
@@ -30,19 +44,14 @@ def informative(
     posed = ~np.isnan(poses[:, 0])
     seen, y = lens_bundle.padded(views, parameters, poses)
     # The poses alone, by pixels instead of rays.
-    held = lens_bundle.solve(lens, y, seen, seen.present, np.zeros(lens_bundle.COUNT, bool))
+    weights = jnp.asarray(seen.present, float)
+    held = lens_bundle.solve(lens, y, seen, weights, np.zeros(COUNT, bool))
     squared = np.sum(np.asarray(held.residual_px) ** 2, axis=(1, 2))[: len(poses)]
     rms_px = np.sqrt(squared / np.maximum([len(view.ids) for view in views.views], 1))
     sound = posed & (rms_px < _WRONG * np.median(rms_px[posed]))
-    each, _ = lens_bundle.view_information(
-        lens, held.unknowns, seen, jnp.asarray(seen.present, float)
-    )
+    each, _ = lens_bundle.view_information(lens, held.unknowns, seen, weights)
     free = lens_bundle.free_mask(lens)
     information = np.asarray(each)[: len(poses)][:, free][:, :, free]
-    return _greedy(information, sound, most)
-
-
-def _greedy(information: np.ndarray, sound: np.ndarray, most: int) -> tuple[int, ...]:
     total = np.sum(information[sound], axis=0)
     scale = 1 / np.sqrt(np.maximum(np.diag(total), 1e-300))
     scaled = information * np.outer(scale, scale)
@@ -51,7 +60,78 @@ def _greedy(information: np.ndarray, sound: np.ndarray, most: int) -> tuple[int,
     chosen: list[int] = []
     while left and len(chosen) < most:
         _, gain = np.linalg.slogdet(known + scaled[left])
-        best = int(left.pop(int(np.argmax(gain))))
-        chosen.append(best)
-        known = known + scaled[best]
+        chosen.append(int(left.pop(int(np.argmax(gain)))))
+        known = known + scaled[chosen[-1]]
     return tuple(sorted(chosen))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of views that a lens was not fitted to."""
+
+    # standard deviation of a corner's x and of its y; NaN for views without weight
+    view_px: Float[np.ndarray, " V"]
+    rms_px: float  # root mean square of `view_px`
+
+
+def held_out(fit: LensFit, weights: Float[np.ndarray, "V P"]) -> HeldOut:
+    """The error of every view under the lens fitted without it.
+
+    Args:
+        weights: (V, P) of the corners, the same for all lenses that are compared.
+    """
+    seen, y = lens_bundle.padded(fit.views, fit.parameters, fit.Ts_camera_board)
+    count, rows = len(fit.views.views), len(seen.corners_px)
+    padded = np.zeros(seen.present.shape)
+    padded[:count] = weights
+    free = lens_bundle.free_mask(fit.lens, fit.fixed)
+    fold = np.arange(rows) % _FOLDS
+    view_px = np.full(count, np.nan)
+    for number in range(_FOLDS):
+        others = np.where((fold != number)[:, None], padded, 0)
+        trained = lens_bundle.solve(fit.lens, y, seen, others, free, fit.sigma_px)
+        start = LensUnknowns(trained.unknowns.lens, y.Ts_camera_board)
+        held = lens_bundle.solve(fit.lens, start, seen, padded, np.zeros(COUNT, bool), fit.sigma_px)
+        squared = np.sum(padded * np.sum(np.asarray(held.residual_px) ** 2, axis=-1), axis=1)
+        freedom = 2 * np.sum(padded > 0, axis=1) - 6
+        rated = np.flatnonzero((fold[:count] == number) & (freedom[:count] > 0))
+        view_px[rated] = np.sqrt(squared[rated] / freedom[rated])
+    return HeldOut(view_px, float(np.sqrt(np.nanmean(view_px**2))))
+
+
+def compared(fits: Mapping[str, LensFit]) -> dict[str, HeldOut]:
+    """The errors of unseen views under every lens; empty where there are too few of either."""
+    trusted = min(fits.values(), key=lambda fit: fit.sigma_px)
+    if len(fits) < 2 or np.sum(trusted.view_weights > 0) < FEWEST_VIEWS:
+        return {}
+    return {lens: held_out(fit, trusted.weights) for lens, fit in fits.items()}
+
+
+def best_lens(
+    fits: Mapping[str, LensFit], errors: Mapping[str, HeldOut], drawn: Collection[str]
+) -> str:
+    """The lens that most programs read, radtan, unless another is clearly better.
+
+    Args:
+        errors: of unseen views, if there are enough views to leave any out.
+        drawn: the lenses that draw the whole image as fitted; radtan folds where it is wide.
+    """
+    if not errors:
+        least = min(drawn or fits, key=lambda one: fits[one].sigma_px)
+        usual = "radtan" in drawn and fits["radtan"].sigma_px < _FEW_WORSE * fits[least].sigma_px
+        return "radtan" if usual else least
+    usual_lens = "radtan" if "radtan" in drawn or not drawn else next(iter(drawn))
+    if errors["none"].rms_px <= _WORSE * errors[usual_lens].rms_px:
+        usual_lens = "none"
+    best = min(drawn or errors, key=lambda lens: errors[lens].rms_px)
+    return best if clearly_better(errors[best], errors[usual_lens]) else usual_lens
+
+
+def clearly_better(one: HeldOut, other: HeldOut) -> bool:
+    """True if one lens explains unseen views better than the other, by more than chance."""
+    ratio, errors = _CLEARLY
+    difference = np.log(other.view_px / one.view_px)
+    difference = difference[np.isfinite(difference)]
+    if len(difference) < 2 or other.rms_px < ratio * one.rms_px:
+        return False
+    return bool(difference.mean() > errors * difference.std(ddof=1) / np.sqrt(len(difference)))

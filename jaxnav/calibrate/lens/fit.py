@@ -10,13 +10,14 @@ Source: Rousseeuw and Leroy (1987), "Robust regression and outlier detection", c
 (reweighted least squares). Hausman (1978), "Specification tests in econometrics".
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
+from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.calibrate.lens import bundle as lens_bundle
 from jaxnav.calibrate.lens.bundle import (
     COUNT,
@@ -27,8 +28,6 @@ from jaxnav.calibrate.lens.bundle import (
     LensUnknowns,
 )
 from jaxnav.calibrate.lens.start import board_poses, lens_start
-from jaxnav.calibrate.lens.views import BoardViews
-from jaxnav.calibrate.parts import leveraged_inflation
 from jaxnav.core.models.camera import Camera
 
 _CUT = 2.0  # in sigmas, of Cauchy's cost
@@ -39,40 +38,29 @@ _ROBUST_ROUNDS, _ROUNDS = 3, 10
 _BY_CHANCE = 0.05  # probability that weights of good views change the lens by as much
 _NOTICED_SIGMAS = 2.0  # views that disagree by less may do so by chance
 _LEAST_SIGMA_PX = 1e-6
+_LEAST_LEFT = 1e-3  # of a direction that one view alone tells
 
 
 @dataclass(frozen=True)
 class LensFit:
-    """A lens fitted to views, with its covariance, the board's poses and the residuals.
-
-    Attributes:
-        parameters: (9,) fx fy cx cy and the coefficients in the camera's order.
-        covariance: (9, 9) of the parameters; zero for fixed ones.
-        inflation: the factor in it by which views disagree beyond the noise of their corners.
-        fixed: names of the parameters held at zero.
-        Ts_camera_board: (V, 7) wxyz_xyz.
-        residual_px: (V, P, 2) predicted - seen; 0 for points not seen.
-        used: (V, P) true for corners in the fit.
-        view_weights: (V,) 1; 0 if the view is left out; less than 1 if it is worse than the others
-            and the lens would be another one by it.
-        view_sigma_px: (V,) standard deviation of a corner's x and of its y; inf without a pose.
-        sigma_px: the same for a view of weight 1, over the whole fit.
-        converged: true if the search ended before its limit of steps.
-    """
+    """A lens fitted to views, with its covariance, the board's poses and the residuals."""
 
     lens: str
     views: BoardViews
-    parameters: Float[np.ndarray, " 9"]
-    covariance: Float[np.ndarray, "9 9"]
-    inflation: float
-    fixed: tuple[str, ...]
-    Ts_camera_board: Float[np.ndarray, "V 7"]
-    residual_px: Float[np.ndarray, "V P 2"]
-    used: Bool[np.ndarray, "V P"]
+    parameters: Float[np.ndarray, " 9"]  # fx fy cx cy and the coefficients in the camera's order
+    covariance: Float[np.ndarray, "9 9"]  # of the parameters; zero for fixed ones
+    inflation: float  # the factor in it by which views disagree beyond the noise of their corners
+    fixed: tuple[str, ...]  # names of the parameters held at zero
+    Ts_camera_board: Float[np.ndarray, "V 7"]  # wxyz_xyz
+    residual_px: Float[np.ndarray, "V P 2"]  # predicted - seen; 0 for points not seen
+    used: Bool[np.ndarray, "V P"]  # true for corners in the fit
+    # 1; 0 if the view is left out; less than 1 if it is worse than the others and the lens would be
+    # another one by it
     view_weights: Float[np.ndarray, " V"]
+    # standard deviation of a corner's x and of its y; inf without a pose
     view_sigma_px: Float[np.ndarray, " V"]
-    sigma_px: float
-    converged: bool
+    sigma_px: float  # the same for a view of weight 1, over the whole fit
+    converged: bool  # true if the search ended before its limit of steps
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,6 +88,12 @@ class LensFit:
     def rms_px(self) -> float:
         """RMS distance of the corners in the fit from their predictions, as OpenCV defines it."""
         return float(np.sqrt(np.mean(np.sum(self.residual_px[self.used] ** 2, axis=-1))))
+
+    @property
+    def used_px(self) -> Float[np.ndarray, "N 2"]:
+        """(N, 2) the corners that are in the fit, px."""
+        seen_px = np.asarray(lens_bundle.padded_corners(self.views).corners_px)
+        return seen_px[: len(self.used)][self.used]
 
     @property
     def weights(self) -> Float[np.ndarray, "V P"]:
@@ -137,27 +131,23 @@ def fit_lens(
     bundle = problem.solved(y, weights, sigma_px, _CUT)
     used, view_weights = problem.judged(np.asarray(bundle.residual_px), sigma_px)
     for _ in range(_ROUNDS):
-        weights = used * view_weights[:, None]
-        bundle = problem.solved(bundle.unknowns, weights, sigma_px, NO_CUT)
+        bundle, sigma_px = problem.fitted(bundle.unknowns, used * view_weights[:, None], sigma_px)
         residual_px = np.asarray(bundle.residual_px)
-        sigma_px = problem.sigma_px(residual_px, weights)
         before = used, view_weights
         # By the median view: a few bad ones would raise the sigma until they pass for good.
         used, view_weights = problem.judged(residual_px, problem.typical_px(residual_px))
         if np.array_equal(used, before[0]) and np.allclose(view_weights, before[1], rtol=0.05):
             break
     used, view_weights = before  # those of the last fit
-    inflation = problem.inflation(bundle.unknowns, weights, sigma_px)
-    covariance = inflation * problem.covariance(bundle, sigma_px)
+    inflation, covariance = problem.uncertainty(bundle, used * view_weights[:, None], sigma_px)
     if np.any((view_weights > 0) & (view_weights < 1)):
         equal = (view_weights > 0).astype(float)
-        plain = problem.solved(bundle.unknowns, used * equal[:, None], sigma_px, NO_CUT)
+        weights = used * equal[:, None]
+        plain, plain_sigma_px = problem.fitted(bundle.unknowns, weights, sigma_px)
         if problem.same_lens(bundle, plain, covariance):
-            bundle, view_weights, weights = plain, equal, used * equal[:, None]
-            residual_px = np.asarray(bundle.residual_px)
-            sigma_px = problem.sigma_px(residual_px, weights)
-            inflation = problem.inflation(bundle.unknowns, weights, sigma_px)
-            covariance = inflation * problem.covariance(bundle, sigma_px)
+            bundle, sigma_px, view_weights = plain, plain_sigma_px, equal
+            inflation, covariance = problem.uncertainty(bundle, weights, sigma_px)
+    residual_px = np.asarray(bundle.residual_px)
     return LensFit(
         lens=lens,
         views=views,
@@ -203,12 +193,13 @@ class _Problem:
         each = self.view_sigma_px(residual_px)[self.posed]
         return max(float(np.median(each)) if len(each) else 1.0, _LEAST_SIGMA_PX)
 
-    def sigma_px(self, residual_px: np.ndarray, weights: np.ndarray) -> float:
-        """Standard deviation of a corner's coordinate at weight 1, over the corners in the fit."""
+    def fitted(self, y: LensUnknowns, weights: np.ndarray, sigma_px: float) -> tuple[Bundle, float]:
+        """Plain least squares, and the deviation of a corner's coordinate at weight 1 in it, px."""
+        bundle = self.solved(y, weights, sigma_px, NO_CUT)
         views = np.any(weights > 0, axis=1).sum()
         freedom = 2 * np.sum(weights > 0) - 6 * views - self.free.sum()
-        squared = float(np.sum(weights * np.sum(residual_px**2, axis=-1)))
-        return max(float(np.sqrt(squared / max(freedom, 1))), _LEAST_SIGMA_PX)
+        squared = float(np.sum(weights * np.sum(np.asarray(bundle.residual_px) ** 2, axis=-1)))
+        return bundle, max(float(np.sqrt(squared / max(freedom, 1))), _LEAST_SIGMA_PX)
 
     def judged(self, residual_px: np.ndarray, sigma_px: float) -> tuple[np.ndarray, np.ndarray]:
         """Judge corners and views: a mask of the right corners (V, P) and view weights (V,)."""
@@ -241,37 +232,34 @@ class _Problem:
         squared = float(moved / sigma @ np.linalg.solve(correlation, moved / sigma))
         return squared < stats.chi2.isf(_BY_CHANCE, self.free.sum())
 
-    def inflation(self, y: LensUnknowns, weights: np.ndarray, sigma_px: float) -> float:
-        """The factor of the variances by which the views disagree; 1 where there are too few."""
+    def uncertainty(
+        self, bundle: Bundle, weights: np.ndarray, sigma_px: float
+    ) -> tuple[float, np.ndarray]:
+        """The factor of the variances by which the views disagree, 1 where there are too few; and
+        the covariance (9, 9), zero for fixed parameters, infinite if the views tell nothing."""
         information, gradient = lens_bundle.view_information(
-            self.lens, y, self.seen, jnp.asarray(weights)
+            self.lens, bundle.unknowns, self.seen, jnp.asarray(weights)
         )
         shown = np.any(weights > 0, axis=1)
         each = np.asarray(information)[shown][:, self.free][:, :, self.free]
         scores = np.asarray(gradient)[shown][:, self.free] / sigma_px
         scale = 1 / np.sqrt(np.maximum(np.einsum("bii->i", each), 1e-300))
-        each, scores = each * np.outer(scale, scale), scores * scale
         try:
-            return leveraged_inflation(each, scores, _NOTICED_SIGMAS)
+            factor = _leveraged_inflation(each * np.outer(scale, scale), scores * scale)
         except np.linalg.LinAlgError:  # the views don't tell all of them
-            return 1.0
-
-    def covariance(self, bundle: Bundle, sigma_px: float) -> np.ndarray:
-        """(9, 9) covariance; zero for fixed parameters, infinite if the views tell nothing."""
-        information = np.asarray(
-            lens_bundle.lens_information(bundle.blocks, jnp.asarray(self.free))
-        )[np.ix_(self.free, self.free)]
-        result = np.zeros((COUNT, COUNT))
-        scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+            factor = 1.0
+        inside = np.ix_(self.free, self.free)
+        total = np.asarray(lens_bundle.lens_information(bundle.blocks, jnp.asarray(self.free)))
+        scale = 1 / np.sqrt(np.maximum(np.diag(total[inside]), 1e-300))
+        covariance = np.zeros((COUNT, COUNT))
         try:
-            inverse = np.linalg.inv(information * np.outer(scale, scale))
-            inside = sigma_px**2 * inverse * np.outer(scale, scale)
+            inverse = np.linalg.inv(total[inside] * np.outer(scale, scale))
+            covariance[inside] = factor * sigma_px**2 * inverse * np.outer(scale, scale)
         except np.linalg.LinAlgError:
-            inside = np.full_like(information, np.inf)
-        if not np.all(np.diag(inside) > 0):
-            inside = np.full_like(information, np.inf)
-        result[np.ix_(self.free, self.free)] = inside
-        return result
+            covariance[inside] = np.inf
+        if not np.all(np.diag(covariance[inside]) > 0):
+            covariance[inside] = np.inf
+        return factor, covariance
 
 
 def _posed_anew(
@@ -283,7 +271,8 @@ def _posed_anew(
     y = bundle.unknowns
     if not len(far):
         return y
-    poses = board_poses(views, problem.lens, np.asarray(y.lens), far.tolist())
+    few = replace(views, views=tuple(views.views[i] for i in far))
+    poses = board_poses(few, problem.lens, np.asarray(y.lens))
     Ts_camera_board = np.array(y.Ts_camera_board)
     Ts_camera_board[far] = np.where(np.isnan(poses), Ts_camera_board[far], poses)
     again = LensUnknowns(y.lens, jnp.asarray(Ts_camera_board))
@@ -291,3 +280,29 @@ def _posed_anew(
     worse = problem.view_sigma_px(residual_px) >= each
     Ts_camera_board[worse] = np.asarray(y.Ts_camera_board)[worse]
     return LensUnknowns(y.lens, jnp.asarray(Ts_camera_board))
+
+
+def _leveraged_inflation(
+    information: Float[np.ndarray, "V p p"], scores: Float[np.ndarray, "V p"]
+) -> float:
+    """The factor of the variances where few views tell much each; 1 if it is not noticed.
+
+    A view draws the solution towards itself, by its share of the information, so its score is
+    smaller than its error: each is divided by the root of what is left of it. Of independent noise
+    the factor has the mean 1 exactly.
+
+    Args:
+        information: of the p shared unknowns from each view, its pose eliminated, for noise of 1.
+        scores: gradient of half the cost of each view by them, of residuals in units of noise.
+
+    Source: Bell, McCaffrey (2002), "Bias reduction in standard errors for linear regression with
+    multi-stage samples".
+    """
+    lower = np.linalg.cholesky(information.sum(axis=0))
+    whitened = np.linalg.solve(lower, np.swapaxes(np.linalg.solve(lower, information), 1, 2))
+    shares, axes = np.linalg.eigh(whitened)
+    along = np.einsum("bij,bi->bj", axes, np.linalg.solve(lower, scores.T).T)
+    count = information.shape[1]
+    ratio = float(np.sum(along**2 / np.maximum(1 - shares, _LEAST_LEFT)) / count)
+    chance = float(np.sqrt(2 * np.sum(shares**2)) / count)
+    return ratio if ratio > 1 + _NOTICED_SIGMAS * chance else 1.0

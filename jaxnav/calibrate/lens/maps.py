@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxnav.calibrate.lens import bundle as lens_bundle
 from jaxnav.calibrate.lens.fit import LensFit
@@ -27,15 +27,11 @@ _STEPS = 8  # of Gauss, Newton
 
 @dataclass(frozen=True)
 class ImageMap:
-    """Values over an image in a grid of h x w pixels.
+    """Values over an image in a grid of h x w pixels."""
 
-    Attributes:
-        pixels: (h, w, 2), where the values are.
-        shift_px: (h, w, 2), by which the second lens draws a ray elsewhere; NaN where one of the
-            lenses does not draw it. Of a sigma, along x and y.
-    """
-
-    pixels: Float[np.ndarray, "h w 2"]
+    pixels: Float[np.ndarray, "h w 2"]  # where the values are
+    # by which the second lens draws a ray elsewhere; NaN where one of the lenses does not draw it.
+    # Of a sigma, along x and y.
     shift_px: Float[np.ndarray, "h w 2"]
 
     @property
@@ -55,9 +51,7 @@ def grid_px(image_size_px: tuple[int, int]) -> Float[np.ndarray, "h w 2"]:
 def projection_sigma(fit: LensFit) -> ImageMap:
     """One standard deviation of where a ray is drawn, along x and y, px."""
     pixels = grid_px(fit.views.image_size_px)
-    by_lens, by_turn, drawn = jax.device_get(
-        _slopes(fit.lens, jnp.asarray(fit.parameters), jnp.asarray(pixels.reshape(-1, 2)))
-    )
+    by_lens, by_turn, drawn = ray_slopes(fit.lens, fit.parameters, pixels.reshape(-1, 2))
     # What a turn of the camera explains is no error of the lens.
     J, turns = by_lens.reshape(-1, by_lens.shape[-1]), by_turn.reshape(-1, 3)
     seen = np.repeat(drawn, 2)
@@ -68,10 +62,16 @@ def projection_sigma(fit: LensFit) -> ImageMap:
     return ImageMap(pixels, sigma_px.reshape(pixels.shape))
 
 
+def ray_slopes(
+    lens: str, parameters: Float[np.ndarray, " 9"], pixels: Float[np.ndarray, "N 2"]
+) -> tuple[Float[np.ndarray, "N 2 9"], Float[np.ndarray, "N 2 3"], Bool[np.ndarray, " N"]]:
+    """Slopes of the pixels of fixed rays by the nine parameters, and by a turn of the camera; and
+    whether the lens draws the ray of a pixel there."""
+    return jax.device_get(_slopes(lens, jnp.asarray(parameters), jnp.asarray(pixels)))
+
+
 @partial(jax.jit, static_argnames="lens")
 def _slopes(lens: str, parameters: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Slopes of the pixels of fixed rays by the nine parameters (N, 2, 9) and by a turn (N, 2, 3);
-    and whether the lens draws the ray of a pixel there."""
     rays = lens_bundle.camera_of(lens, parameters).unproject(pixels)
 
     def draw(parameters: Array, turn: Array) -> Array:

@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibrate.lens.views import BoardView, BoardViews
+from jaxnav.calibrate.board.views import BoardView, BoardViews
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import transform_points
 
+_unprojected = jax.jit(Camera.unproject)
 _FACING = np.diag([1.0, -1.0, -1.0])  # R_camera_board of a board that hangs upright, seen head-on
 
 
@@ -49,7 +50,7 @@ def simulated_views(
     poses: list[np.ndarray] = []
     while len(views) < count:
         middle_px = size / 2 + reach * rng.uniform(-0.5, 0.5, 2) * size
-        sight = np.asarray(_sight(camera, jnp.asarray(middle_px)))
+        sight = np.asarray(_unprojected(camera, jnp.asarray(middle_px)))
         R_camera_board = _orientation(sight, most_tilt_deg, rng)
         wxyz = np.roll(Rotation.from_matrix(R_camera_board).as_quat(), 1)
         pose = np.concatenate([wxyz, sight * rng.uniform(*distances_m)])
@@ -80,11 +81,6 @@ def seen_from(
 
 
 @jax.jit
-def _sight(camera: Camera, middle_px: jax.Array) -> jax.Array:
-    return camera.unproject(middle_px)
-
-
-@jax.jit
 def _projected(
     camera: Camera, T_camera_board: jaxlie.SE3, points_board: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -100,6 +96,6 @@ def _orientation(sight: np.ndarray, most_tilt_deg: float, rng: np.random.Generat
     if most_tilt_deg == 0:
         return np.asarray(_FACING @ roll)
     azimuth, tilt = rng.uniform(0, 2 * np.pi), np.deg2rad(most_tilt_deg) * np.sqrt(rng.uniform())
-    tilted = Rotation.from_rotvec(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0]))
+    tilted = Rotation.from_rotvec([tilt * np.cos(azimuth), tilt * np.sin(azimuth), 0])
     turn = Rotation.align_vectors([sight], [[0, 0, 1]])[0]  # the axis onto the line of sight
-    return np.asarray(turn.as_matrix() @ tilted.as_matrix() @ _FACING @ roll)
+    return np.asarray((turn * tilted).as_matrix() @ _FACING @ roll)

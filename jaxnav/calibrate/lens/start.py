@@ -13,15 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
+from jaxnav.calibrate.board.views import BoardView, BoardViews, pose_from_rays
 from jaxnav.calibrate.lens import bundle as lens_bundle
-from jaxnav.calibrate.lens.views import BoardView, BoardViews
 
 _FOCALS = np.geomspace(0.2, 3.0, 14)  # in image widths: 140 degrees and more, to a tele lens
 _MOST_VIEWS = 24  # OpenCV's time grows with the cube of their number
-_WIDEST = np.tan(np.deg2rad(80.0))  # from the middle of a view; steeper rays weigh too much
-_FEWEST = 4  # points a pose can be found from
 # Coefficients of wide lenses that OpenCV does not calibrate, typical ones; others start at zero.
 _TYPICAL = {"omni": (1.0,), "double_sphere": (0.0, 0.6), "eucm": (0.6, 1.0)}
 
@@ -32,7 +29,7 @@ def lens_start(views: BoardViews, lens: str) -> tuple[Float[np.ndarray, " 9"], f
     Also return the median distance of a corner from its prediction, px.
     """
     some = np.unique(np.linspace(0, len(views.views) - 1, _MOST_VIEWS).round().astype(int))
-    few = BoardViews(views.points_board_m, views.image_size_px, tuple(views.views[i] for i in some))
+    few = replace(views, views=tuple(views.views[i] for i in some))
     width, height = views.image_size_px
     guess = np.zeros(lens_bundle.COUNT)
     typical = _TYPICAL.get(lens, ())
@@ -47,64 +44,27 @@ def lens_start(views: BoardViews, lens: str) -> tuple[Float[np.ndarray, " 9"], f
 
 
 def board_poses(
-    views: BoardViews,
-    lens: str,
-    parameters: Float[np.ndarray, " 9"],
-    chosen: Sequence[int] | None = None,
+    views: BoardViews, lens: str, parameters: Float[np.ndarray, " 9"]
 ) -> Float[np.ndarray, "V 7"]:
     """(V, 7) T_camera_board of every view, found from that view alone; NaN where none is found.
 
     Corners become rays, and the rays are projected into a pinhole camera that looks at their
     middle, whatever its angle to the real axis. Of IPPE's two poses, that of lower error is taken.
 
-    Args:
-        chosen: the views, by number; all of them if not given.
-
     Source: Collins and Bartoli (2014), "Infinitesimal plane-based pose estimation", by OpenCV.
     """
-    shown = [views.views[i] for i in range(len(views.views)) if chosen is None or i in set(chosen)]
-    corners_px = lens_bundle.padded_corners(replace(views, views=tuple(shown))).corners_px
-    rays = np.asarray(_rays(lens, jnp.asarray(parameters), jnp.asarray(corners_px)))
-    return np.array(
-        [
-            pose_from_rays(views.points_board_m[view.ids], rays[row, view.ids])
-            for row, view in enumerate(shown)
-        ]
-    ).reshape(-1, 7)
+    corners_px = jnp.asarray(lens_bundle.padded_corners(views).corners_px)
+    rays = np.asarray(_rays(lens, jnp.asarray(parameters), corners_px))
+    poses = [
+        pose_from_rays(views.points_board_m[view.ids], rays[row, view.ids])
+        for row, view in enumerate(views.views)
+    ]
+    return np.reshape(poses, (-1, 7))
 
 
 @partial(jax.jit, static_argnames="lens")
 def _rays(lens: str, parameters: Array, corners_px: Array) -> Array:
     return lens_bundle.camera_of(lens, parameters).unproject(corners_px)
-
-
-def pose_from_rays(
-    points_board_m: Float[np.ndarray, "N 3"], rays_camera: Float[np.ndarray, "N 3"]
-) -> Float[np.ndarray, " 7"]:
-    """T_camera_board (7,) of a view from its points and their rays; NaN where none is found."""
-    nowhere = np.full(7, np.nan)
-    middle = rays_camera.mean(axis=0)
-    if len(points_board_m) < _FEWEST or np.linalg.norm(middle) < 1e-3:
-        return nowhere
-    turn = Rotation.align_vectors([[0, 0, 1]], [middle / np.linalg.norm(middle)])[0]
-    turned = turn.apply(rays_camera)
-    image = turned[:, :2] / np.maximum(turned[:, 2:], 1e-9)
-    near = np.linalg.norm(image, axis=1) < _WIDEST
-    if near.sum() < _FEWEST:
-        return nowhere
-    centre_m = points_board_m[near].mean(axis=0)  # IPPE needs no centring, but is better for it
-    try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            points_board_m[near] - centre_m, image[near], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error:  # points on one line
-        return nowhere
-    if not rotations:
-        return nowhere
-    R = turn.inv() * Rotation.from_rotvec(rotations[0].ravel())
-    t_m = turn.inv().apply(translations[0].ravel()) - R.apply(centre_m)
-    pose = np.concatenate([np.roll(R.as_quat(), 1), t_m])
-    return pose if np.all(np.isfinite(pose)) else nowhere
 
 
 def _misfit_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:

@@ -14,8 +14,7 @@ gain * steering / wheelbase; only the car's sideslip, and the bend of the tangen
 tell one from the other. The delay shows where speed or steering change.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,30 +23,54 @@ from jaxtyping import Bool, Float
 from jaxnav.calibrate.odometry.drive import (
     Course,
     Drive,
+    Intervals,
     ReadingSigma,
     lay_out,
     reading_sigma,
 )
 from jaxnav.calibrate.odometry.fit import OdometryFit, Prior, fit
 from jaxnav.calibrate.odometry.model import FULL_WEIGHT, NAMES, Model
-from jaxnav.calibrate.odometry.motion import STEERED_LITTLE, cannot_tell, driven_m
 from jaxnav.calibrate.odometry.start import LOOSE, TIGHT, start
 from jaxnav.calibrate.parts import variance_inflation
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
 
-# Largest accepted sigma of each parameter: relative, in rad and in s.
+_CIRCLES = "drive circles at full lock both ways"
+# The largest accepted sigma of each parameter, relative to it or in its unit, and what to do where
+# it is larger. Of two that can't be told apart, the first here stays as it was: measured by tape,
+# or less vital.
 _LEAST_SURE = {
-    "speed_scale": 0.02,
-    "steering_gain": 0.02,
-    "steering_offset_rad": 0.01,
-    "wheelbase_m": 0.02,
-    "camera_delay_s": 0.01,
+    "wheelbase_m": (
+        0.02,
+        True,
+        f"steering gain and wheelbase can't be told apart: {_CIRCLES}, or measure the wheelbase "
+        "with a tape",
+    ),
+    "camera_delay_s": (
+        0.01,
+        False,
+        "the drive does not tell it: stop and start more often in view of a marker",
+    ),
+    "steering_gain": (0.02, True, f"the drive does not tell it: {_CIRCLES}, near a marker"),
+    "steering_offset_rad": (
+        0.01,
+        False,
+        "the drive does not tell it: drive longer in view of a marker",
+    ),
+    "speed_scale": (0.02, True, ""),  # without it there is nothing
 }
-_RELATIVE = ("speed_scale", "steering_gain", "wheelbase_m")
-# Of two that can't be told apart, the first here stays as it was: measured by tape, or less vital.
-_KEPT_FIRST = ("wheelbase_m", "camera_delay_s", "steering_gain", "steering_offset_rad")
+_STEERED_LITTLE = (
+    "the steering hardly changed while the car moved: drive eights, at full lock both ways, to "
+    "find it"
+)
+_TURNED_LITTLE = f"the car hardly turned: {_CIRCLES} to find it"
+_CHANGED_LITTLE = "neither speed nor steering changed: stop and start, or drive eights, to find it"
+_GIVEN = "as given by --fix"
+_VARIED_RAD, _VARIED_MPS = 0.03, 0.03  # below, noise could pass for steering or driving
+_VARIED_SHARE = 0.2  # of the speed: a single start tells little about the delay
+_ASIDE_RAD = 0.05  # at a constant steering this far from straight, gain and offset are one
+_BLOCK = 15  # readings to average, some 0.3 s
 _GAIN_SIGMA = 0.1  # of a gain that was kept, for its effect on the offset's sigma
 _LEAST_WAY_M = 1.0
 _NOTICED = 1.5  # a smaller inflation counts as none: 20 parts tell no better
@@ -55,59 +78,31 @@ _REFUSED_CHI2, _AGAIN_CHI2 = 4.0, 1.2  # per degree of freedom
 _MOST_OUTLIERS, _AGAIN_OUTLIERS = 0.3, 0.05
 _OTHER = (0.1, TIGHT, TIGHT)  # errors of the odometry, for further starts
 
-_WHY = {
-    "wheelbase_m": "steering gain and wheelbase can't be told apart: drive circles at full lock "
-    "both ways, or measure the wheelbase with a tape",
-    "camera_delay_s": "the drive does not tell it: stop and start more often in view of a marker",
-    "steering_gain": "the drive does not tell it: drive circles at full lock both ways, near a "
-    "marker",
-    "steering_offset_rad": "the drive does not tell it: drive longer in view of a marker",
-}
-
 
 @dataclass(frozen=True)
 class OdometryCalibration:
-    """The calibrated parameters of the odometry, with their uncertainty and the fitted course.
+    """The calibrated parameters of the odometry, with their uncertainty and the fitted course."""
 
-    Attributes:
-        before: name -> value at the start, see `model.NAMES`.
-        value: name -> value; fixed parameters are as before.
-        sigma: name -> standard deviation, of the parameters found.
-        fixed: name -> why it was not fitted.
-        correlation: between the parameters found, in the order of `sigma`.
-        chi2_per_dof: 1 if the sigmas of readings and corners are right.
-        inflation: of the variances, where parts of the drives disagree; else 1. The sigmas have
-            grown by the root of the larger one of the two.
-        rms_px: RMS residual of corners along one axis, without outliers.
-        outliers: (V,) bool, true for views that count less because they are far off.
-        views_px: (V, 4, 2), residuals.
-        view_times_s: (V,), on the time axis of the course.
-        node_times_s: (N + 1,).
-        poses: (N + 1, 3), x_m y_m psi_rad.
-        read: (N, 2), speed and steering as read, m/s and rad.
-        reading_sigma: the noise of the readings.
-        way_m: distance driven while markers were in view.
-        advice: sentences on what to drive next.
-    """
-
-    before: dict[str, float]
-    value: dict[str, float]
-    sigma: dict[str, float]
-    fixed: dict[str, str]
-    correlation: Float[np.ndarray, "p p"]
-    chi2_per_dof: float
+    before: dict[str, float]  # name -> value at the start, see `model.NAMES`
+    value: dict[str, float]  # name -> value; fixed parameters are as before
+    sigma: dict[str, float]  # name -> standard deviation, of the parameters found
+    fixed: dict[str, str]  # name -> why it was not fitted
+    correlation: Float[np.ndarray, "p p"]  # between the parameters found, in the order of `sigma`
+    chi2_per_dof: float  # 1 if the sigmas of readings and corners are right
+    # of the variances, where parts of the drives disagree; else 1. The sigmas have grown by the
+    # root of the larger one of the two.
     inflation: float
-    rms_px: float
-    outliers: Bool[np.ndarray, " V"]
-    views_px: Float[np.ndarray, "V 4 2"]
-    view_times_s: Float[np.ndarray, " V"]
+    rms_px: float  # RMS residual of corners along one axis, without outliers
+    outliers: Bool[np.ndarray, " V"]  # true for views that count less because they are far off
+    views_px: Float[np.ndarray, "V 4 2"]  # residuals
+    view_times_s: Float[np.ndarray, " V"]  # on the time axis of the course
     node_times_s: Float[np.ndarray, " nodes"]
-    poses: Float[np.ndarray, "nodes 3"]
-    read: Float[np.ndarray, "nodes-1 2"]
-    reading_sigma: ReadingSigma
-    way_m: float
+    poses: Float[np.ndarray, "nodes 3"]  # x_m y_m psi_rad
+    read: Float[np.ndarray, "nodes-1 2"]  # speed and steering as read, m/s and rad
+    reading_sigma: ReadingSigma  # the noise of the readings
+    way_m: float  # distance driven while markers were in view
     duration_s: float
-    advice: tuple[str, ...]
+    advice: tuple[str, ...]  # sentences on what to drive next
 
 
 def calibrate_odometry(
@@ -136,25 +131,40 @@ def calibrate_odometry(
     theta = np.array([before[name] for name in NAMES])
     course = lay_out(drives)
     sigma = reading_sigma(course.intervals)
-    way_m = theta[0] * driven_m(course.intervals)
+    speed_mps, size = _block_means(course.intervals, course.intervals.speed_mps)
+    dt_s, _ = _block_means(course.intervals, course.intervals.dt_s)
+    way_m = float(theta[0] * np.sum(np.abs(speed_mps) * dt_s * size))  # noise adds no length
     if way_m < _LEAST_WAY_M:
         problem = (
             f"by its odometry the car drove {way_m:.2f} m in view of markers, at least "
             f"{_LEAST_WAY_M:g} m are needed: drive eights in front of a marker for a minute"
         )
         raise BadInput(where, problem)
-    why = dict.fromkeys(fixed, "as told by --fix")
-    untold, steering_rad = cannot_tell(course.intervals, sigma, where, fixed)
-    why |= untold
+    undetermined, steering_rad = _undetermined(course.intervals, sigma, where, fixed)
+    why = dict.fromkeys(fixed, _GIVEN) | undetermined
     information = np.zeros(len(NAMES))
     if wheelbase_sigma_m is not None:
         information[NAMES.index("wheelbase_m")] = wheelbase_sigma_m**-2
     prior = Prior(theta, information)
-    search = _Search(Model(course, rig, markers, sigma), course, rig, markers, prior, progress)
-    with _computable(where):
-        solution = search.best(theta, why)
-        chi2 = _chi2_per_dof(solution, course)
-        outliers = solution.blocks.view_chi2 > FULL_WEIGHT
+    model = Model(course, rig, markers, sigma)
+
+    def fitted(nodes: np.ndarray, theta: np.ndarray) -> OdometryFit:
+        free = np.array([name not in why for name in NAMES])
+        return fit(model, nodes, theta, free, prior, progress)
+
+    def started(theta: np.ndarray, error: float) -> OdometryFit:
+        return fitted(start(course, rig, markers, theta, error), theta)
+
+    try:
+        solution = started(theta, LOOSE)
+        # Where that ends badly: other ways through the poses of single views, other parameters.
+        for again, error in enumerate(_OTHER):
+            chi2, outliers = _chi2_per_dof(solution, course)
+            if solution.converged and chi2 < _AGAIN_CHI2 and np.mean(outliers) < _AGAIN_OUTLIERS:
+                break
+            other = started(solution.theta if again == 1 else theta, error)
+            solution = min(solution, other, key=lambda one: one.blocks.cost)
+        chi2, outliers = _chi2_per_dof(solution, course)
         _refuse_contradiction(where, solution, chi2, outliers)
         while (name := _least_sure(solution, why, max(chi2, 1.0))) is not None:
             if name == "speed_scale":
@@ -163,18 +173,24 @@ def calibrate_odometry(
                     "and around a marker, in view of the cameras"
                 )
                 raise BadInput(where, problem)
-            why[name] = _WHY[name]
-            solution = search.again(solution, why)
-            chi2 = _chi2_per_dof(solution, course)
-            outliers = solution.blocks.view_chi2 > FULL_WEIGHT
+            why[name] = _LEAST_SURE[name][2]
+            kept = np.array([name in why for name in NAMES])
+            solution = fitted(solution.nodes, np.where(kept, theta, solution.theta))
+            chi2, outliers = _chi2_per_dof(solution, course)
         _refuse_contradiction(where, solution, chi2, outliers)
-        free = [name for name in NAMES if name not in why]
         covariance = np.linalg.inv(solution.information)
-        inflation = variance_inflation(solution.scores, covariance, len(free), _NOTICED)
-        covariance = covariance * max(chi2, inflation, 1.0)
-        if why.get("steering_gain") == STEERED_LITTLE and "steering_offset_rad" in free:
-            row = free.index("steering_offset_rad")
-            covariance[row, row] += (_GAIN_SIGMA * steering_rad) ** 2
+    except np.linalg.LinAlgError:
+        problem = (
+            "odometry, cameras and map have no course of a car in common that can be computed: "
+            "check --markers, --rig and --vehicle"
+        )
+        raise BadInput(where, problem) from None
+    free = [name for name in NAMES if name not in why]
+    inflation = variance_inflation(solution.scores, covariance, len(free), _NOTICED)
+    covariance = covariance * max(chi2, inflation, 1.0)
+    if why.get("steering_gain") == _STEERED_LITTLE and "steering_offset_rad" in free:
+        row = free.index("steering_offset_rad")
+        covariance[row, row] += (_GAIN_SIGMA * steering_rad) ** 2
     deviation = np.sqrt(np.diag(covariance))
     return OdometryCalibration(
         before={name: float(before[name]) for name in NAMES},
@@ -198,65 +214,58 @@ def calibrate_odometry(
     )
 
 
-@contextmanager
-def _computable(where: str) -> Iterator[None]:
-    """Turn equations that can't be solved into `BadInput`."""
-    try:
-        yield
-    except np.linalg.LinAlgError:
+def _block_means(intervals: Intervals, values: np.ndarray) -> tuple[np.ndarray, int]:
+    """Means of blocks of readings, and the number of readings in each."""
+    linked = values[intervals.linked > 0]
+    size = min(_BLOCK, len(linked))
+    return linked[: len(linked) // size * size].reshape(-1, size).mean(axis=1), size
+
+
+def _undetermined(
+    intervals: Intervals, sigma: ReadingSigma, where: str, fixed: Sequence[str]
+) -> tuple[dict[str, str], float]:
+    """Name -> why this motion can't determine the parameter, whatever was seen; and the mean
+    steering, rad.
+
+    Mean and spread of speed and steering, the latter weighted by distance, are those of means of
+    blocks of readings, which have little noise; what noise they have is subtracted.
+
+    Raises:
+        BadInput: the steering was turned and constant, so its gain and its offset are one.
+    """
+    speed, size = _block_means(intervals, intervals.speed_mps)
+    steering, _ = _block_means(intervals, intervals.steering_rad)
+    weight = np.abs(speed) / np.sum(np.abs(speed))
+
+    def beyond_noise(variance: float, noise: float) -> float:
+        return float(np.sqrt(max(variance - noise**2 / size, 0.0)))
+
+    steering_rad, speed_mps = float(weight @ steering), float(np.mean(np.abs(speed)))
+    varied_mps = beyond_noise(float(np.var(speed)), sigma.speed_mps)
+    varied_rad = beyond_noise(float(weight @ (steering - steering_rad) ** 2), sigma.steering_rad)
+    steered, aside = varied_rad >= _VARIED_RAD, abs(steering_rad) >= _ASIDE_RAD
+    if aside and not steered and not {"steering_gain", "steering_offset_rad"} & set(fixed):
         problem = (
-            "odometry, cameras and map have no course of a car in common that can be computed: "
-            "check --markers, --rig and --vehicle"
+            f"the steering stood at {steering_rad:.2f} rad all the time, where its gain "
+            "and its offset are one: drive eights, to both sides, or give --fix "
+            "steering_offset_rad"
         )
-        raise BadInput(where, problem) from None
+        raise BadInput(where, problem)
+    reasons: dict[str, str] = {}
+    if not steered and not aside:
+        reasons |= {"steering_gain": _STEERED_LITTLE, "wheelbase_m": _TURNED_LITTLE}
+    if not steered and varied_mps < max(_VARIED_MPS, _VARIED_SHARE * speed_mps):
+        reasons["camera_delay_s"] = _CHANGED_LITTLE
+    return {name: why for name, why in reasons.items() if name not in fixed}, steering_rad
 
 
-@dataclass(frozen=True)
-class _Search:
-    """The search for the best fit of one course, from several starts."""
-
-    model: Model
-    course: Course
-    rig: CameraRig
-    markers: MarkerMap
-    prior: Prior
-    progress: Callable[[], object]
-
-    def best(self, theta: np.ndarray, fixed: Mapping[str, str]) -> OdometryFit:
-        """Fit from the present odometry; if that ends badly, also from other ways through the poses
-        of single views, and from the parameters found."""
-        solution = self._started(theta, fixed, LOOSE)
-        for again in range(3):
-            outliers = float(np.mean(solution.blocks.view_chi2 > FULL_WEIGHT))
-            chi2 = _chi2_per_dof(solution, self.course)
-            if solution.converged and chi2 < _AGAIN_CHI2 and outliers < _AGAIN_OUTLIERS:
-                break
-            other = self._started(solution.theta if again == 1 else theta, fixed, _OTHER[again])
-            solution = min(solution, other, key=lambda one: one.blocks.cost)
-        return solution
-
-    def _started(self, theta: np.ndarray, fixed: Mapping[str, str], error: float) -> OdometryFit:
-        nodes = start(self.course, self.rig, self.markers, theta, error)
-        return self._from(nodes, theta, fixed)
-
-    def again(self, solution: OdometryFit, fixed: Mapping[str, str]) -> OdometryFit:
-        """Fit again from a fit, with more parameters fixed at their values before."""
-        kept = np.array([name in fixed for name in NAMES])
-        return self._from(solution.nodes, np.where(kept, self.prior.mean, solution.theta), fixed)
-
-    def _from(self, nodes: np.ndarray, theta: np.ndarray, fixed: Mapping[str, str]) -> OdometryFit:
-        free = np.array([name not in fixed for name in NAMES])
-        return fit(self.model, nodes, theta, free, self.prior, self.progress)
-
-
-def _chi2_per_dof(solution: OdometryFit, course: Course) -> float:
-    """Chi-square per degree of freedom; outliers among the views count in neither."""
+def _chi2_per_dof(solution: OdometryFit, course: Course) -> tuple[float, np.ndarray]:
+    """Chi-square per degree of freedom, and which views are outliers, which count in neither."""
     chi2 = solution.blocks.view_chi2
-    good = chi2 <= FULL_WEIGHT
-    far = chi2[~good]
-    extra = float(np.sum(FULL_WEIGHT * (1 + np.log(far / FULL_WEIGHT))))
-    dof = 8 * int(good.sum()) - 3 * course.stretches - solution.information.shape[0]
-    return (float(solution.blocks.cost) - extra) / max(dof, 1)
+    outliers = chi2 > FULL_WEIGHT
+    extra = float(np.sum(FULL_WEIGHT * (1 + np.log(chi2[outliers] / FULL_WEIGHT))))
+    dof = 8 * int(np.sum(~outliers)) - 3 * course.stretches - len(solution.information)
+    return (float(solution.blocks.cost) - extra) / max(dof, 1), outliers
 
 
 def _least_sure(solution: OdometryFit, fixed: Mapping[str, str], scale: float) -> str | None:
@@ -267,15 +276,17 @@ def _least_sure(solution: OdometryFit, fixed: Mapping[str, str], scale: float) -
     """
     free = [name for name in NAMES if name not in fixed]
     values = dict(zip(NAMES, solution.theta, strict=True))
-    asked = np.array(
-        [_LEAST_SURE[name] * (abs(values[name]) if name in _RELATIVE else 1.0) for name in free]
-    )
+    largest = {
+        name: sigma * (abs(values[name]) if relative else 1.0)
+        for name, (sigma, relative, _) in _LEAST_SURE.items()
+    }
+    asked = np.array([largest[name] for name in free])
     weakest, directions = np.linalg.eigh(solution.information * np.outer(asked, asked) / scale)
     if not len(free) or weakest[0] >= 1.0:
         return None
     share = np.abs(directions[:, 0])
     involved = [name for name, part in zip(free, share, strict=True) if part > 0.5 * share.max()]
-    return next((name for name in _KEPT_FIRST if name in involved), "speed_scale")
+    return next(name for name in _LEAST_SURE if name in involved)
 
 
 def _refuse_contradiction(
@@ -286,20 +297,20 @@ def _refuse_contradiction(
             f"{outliers.mean():.0%} of the markers seen are not where the map says: check "
             "--markers and --rig, with calibrate check"
         )
-        raise BadInput(where, problem)
-    if not solution.converged:
+    elif not solution.converged:
         problem = (
             "no figures explain the drive best, whatever the search tries: drive eights in view of "
             "a marker, or keep some by --fix"
         )
-        raise BadInput(where, problem)
-    if chi2 > _REFUSED_CHI2:
+    elif chi2 > _REFUSED_CHI2:
         problem = (
             f"odometry and cameras contradict each other (chi-square per degree of freedom "
             f"{chi2:.1f}): check --rig, --markers and --vehicle, drive slowly enough that no "
             "wheel slips, and keep a marker in view"
         )
-        raise BadInput(where, problem)
+    else:
+        return
+    raise BadInput(where, problem)
 
 
 def _advice(
@@ -309,27 +320,20 @@ def _advice(
     outliers: np.ndarray,
     wheelbase_sigma_m: float | None,
 ) -> tuple[str, ...]:
-    lines = [f"{name}: {why}" for name, why in fixed.items() if not why.startswith("as told")]
+    lines = [f"{name}: {why}" for name, why in fixed.items() if why != _GIVEN]
+    slower = "calibrate the cameras and the rig first, and drive more slowly"
     if "wheelbase_m" in fixed and "steering_gain" not in fixed and wheelbase_sigma_m is None:
-        lines.append(
-            "The steering gain is as sure as the wheelbase that was taken as exact: an error of "
-            "1 % there is one of 1 % here."
-        )
+        lines.append("steering_gain: 1 % off for 1 % that the wheelbase, taken as exact, is off")
     if inflation > max(chi2, 1.0):
         lines.append(
-            f"Parts of the drives disagree {np.sqrt(inflation):.1f} times as far as their noise "
-            "explains; all sigma are larger by that. Wheels that slip, or cameras that are off, "
-            "are the likely cause: drive more slowly, and calibrate the cameras and the rig first."
+            f"parts of the drives disagree {np.sqrt(inflation):.1f} times as far as their noise "
+            f"explains, and all sigma are larger by that: {slower}"
         )
     elif chi2 > 1.5:
         lines.append(
-            f"Residuals are {np.sqrt(chi2):.1f} times as large as readings and corners say of "
-            "themselves; all sigma are larger by that. Calibrate the cameras and the rig first, "
-            "and drive more slowly."
+            f"residuals are {np.sqrt(chi2):.1f} times as large as readings and corners say of "
+            f"themselves, and all sigma are larger by that: {slower}"
         )
     if outliers.mean() > 0.02:
-        lines.append(
-            f"{outliers.mean():.0%} of the views are far off: look for reflections, and for "
-            "markers that were moved."
-        )
-    return tuple(lines) or ("Nothing: every figure is found.",)
+        lines.append(f"{outliers.mean():.0%} of the views are far off: reflections, moved markers?")
+    return tuple(lines) or ("nothing: every figure is found",)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.ndimage import median_filter
 
 from jaxnav.errors import BadInput
 
@@ -22,30 +23,18 @@ _LEAST_SIGMA_MPS, _LEAST_SIGMA_RAD = 0.002, 0.001
 
 @dataclass(frozen=True)
 class Drive:
-    """K readings of the odometer and V views of markers; a view is one marker in one frame.
+    """K readings of the odometer and V views of markers; a view is one marker in one frame."""
 
-    Attributes:
-        name: name of the recording.
-        reading_stamps_ns: (K,) int64, by the odometer's clock.
-        speed_mps: (K,), as read, uncorrected.
-        steering_rad: (K,), as read, uncorrected.
-        view_stamps_ns: (V,) int64, by the cameras' clock.
-        camera: (V,) int, index in the rig.
-        marker: (V,) int, index in the map.
-        corners_px: (V, 4, 2).
-        sigma_px: (V, 4), standard deviation of each corner along one axis.
-        left_out: number of readings and views left out for values impossible for a car's sensors.
-    """
-
-    name: str
-    reading_stamps_ns: Int[np.ndarray, " K"]
-    speed_mps: Float[np.ndarray, " K"]
-    steering_rad: Float[np.ndarray, " K"]
-    view_stamps_ns: Int[np.ndarray, " V"]
-    camera: Int[np.ndarray, " V"]
-    marker: Int[np.ndarray, " V"]
+    name: str  # name of the recording
+    reading_stamps_ns: Int[np.ndarray, " K"]  # by the odometer's clock
+    speed_mps: Float[np.ndarray, " K"]  # as read, uncorrected
+    steering_rad: Float[np.ndarray, " K"]  # as read, uncorrected
+    view_stamps_ns: Int[np.ndarray, " V"]  # by the cameras' clock
+    camera: Int[np.ndarray, " V"]  # index in the rig
+    marker: Int[np.ndarray, " V"]  # index in the map
     corners_px: Float[np.ndarray, "V 4 2"]
-    sigma_px: Float[np.ndarray, "V 4"]
+    sigma_px: Float[np.ndarray, "V 4"]  # standard deviation of each corner along one axis
+    # number of readings and views left out for values impossible for a car's sensors
     left_out: int = 0
 
 
@@ -60,32 +49,20 @@ class ReadingSigma(NamedTuple):
 
 
 class Intervals(NamedTuple):
-    """N intervals, each from one node to the next, with one reading in the middle.
+    """N intervals, each from one node to the next, with one reading in the middle."""
 
-    Attributes:
-        begin_s: (N,), on the common time axis.
-        dt_s: (N,).
-        speed_mps, steering_rad: (N,), as read.
-        linked: (N,), 0. for intervals between two stretches, else 1.
-    """
-
-    begin_s: Column
-    dt_s: Column
-    speed_mps: Column
+    begin_s: Column  # (N,), on the common time axis
+    dt_s: Column  # (N,)
+    speed_mps: Column  # (N,), as read, like the next
     steering_rad: Column
-    linked: Column
+    linked: Column  # (N,), 0. for intervals between two stretches, else 1.
 
 
 class MarkerViews(NamedTuple):
-    """V views; see `Drive`.
+    """V views; see `Drive`."""
 
-    Attributes:
-        time_s: (V,), by the cameras' clock, on the common time axis.
-        first, last: (V,) int, first and last interval of the view's stretch.
-    """
-
-    time_s: Column
-    first: Column
+    time_s: Column  # (V,), by the cameras' clock, on the common time axis
+    first: Column  # (V,) int, and `last`: first and last interval of the view's stretch
     last: Column
     camera: Column
     marker: Column
@@ -126,7 +103,7 @@ def lay_out(drives: Sequence[Drive]) -> Course:
         BadInput: there are too few readings or views; the message names the drive.
     """
     parts = [part for drive in drives for part in _stretches(drive)]
-    if sum(len(columns["time_s"]) for _, columns in parts) < _LEAST_VIEWS:
+    if sum(len(seen.time_s) for _, seen in parts) < _LEAST_VIEWS:
         names = ", ".join(drive.name for drive in drives)
         count = sum(len(drive.view_stamps_ns) for drive in drives)
         problem = (
@@ -134,35 +111,22 @@ def lay_out(drives: Sequence[Drive]) -> Course:
             f"{_LEAST_VIEWS} views are needed: drive where a camera sees a marker of --markers"
         )
         raise BadInput(names, problem)
-    begin_s, intervals, views = 0.0, [], []
-    count = 0
-    for number, (readings, seen) in enumerate(parts):
-        times_s, edges_s = readings["time_s"], _edges(readings["time_s"])
-        shift_s = begin_s - edges_s[0]
-        n = len(times_s)
-        intervals.append(
-            Intervals(
-                edges_s[:-1] + shift_s,
-                np.diff(edges_s),
-                readings["speed_mps"],
-                readings["steering_rad"],
-                np.ones(n),
-            )
-        )
-        size = len(seen["time_s"])
-        first, last = np.full(size, count), np.full(size, count + n - 1)
-        on_axis = seen | {"time_s": seen["time_s"] + shift_s}
-        views.append(MarkerViews(first=first, last=last, **on_axis))
-        count += n
-        begin_s = edges_s[-1] + shift_s
-        if number < len(parts) - 1:
-            zero = np.zeros(1)
-            intervals.append(Intervals(zero + begin_s, zero + _BETWEEN_S, zero, zero, zero))
-            begin_s += _BETWEEN_S
-            count += 1
+    intervals: list[Intervals] = []
+    views: list[MarkerViews] = []
+    begin_s, count = 0.0, 0
+    for own, seen in parts:
+        if intervals:
+            gap = np.array([[begin_s], [_BETWEEN_S], [0.0], [0.0], [0.0]])
+            intervals.append(Intervals(*gap))
+            begin_s, count = begin_s + _BETWEEN_S, count + 1
+        shift_s = begin_s - own.begin_s[0]
+        intervals.append(own._replace(begin_s=own.begin_s + shift_s))
+        first, last = (np.full(len(seen.time_s), count + end) for end in (0, len(own.dt_s) - 1))
+        views.append(seen._replace(time_s=seen.time_s + shift_s, first=first, last=last))
+        begin_s, count = begin_s + float(np.sum(own.dt_s)), count + len(own.dt_s)
     return Course(
-        Intervals(*(np.concatenate(column) for column in zip(*intervals, strict=True))),
-        MarkerViews(*(np.concatenate(column) for column in zip(*views, strict=True))),
+        Intervals(*map(np.concatenate, zip(*intervals, strict=True))),
+        MarkerViews(*map(np.concatenate, zip(*views, strict=True))),
     )
 
 
@@ -184,65 +148,43 @@ def reading_sigma(intervals: Intervals) -> ReadingSigma:
     )
 
 
-def _edges(times_s: np.ndarray) -> np.ndarray:
-    """(K + 1,): the midpoints between (K,) instants, and the outer two instants."""
-    middle = (times_s[1:] + times_s[:-1]) / 2
-    return np.concatenate([times_s[:1], middle, times_s[-1:]])
-
-
-_Columns = dict[str, np.ndarray]
-
-
-def _stretches(drive: Drive) -> list[tuple[_Columns, _Columns]]:
-    """Readings and views of each usable stretch of a drive."""
+def _stretches(drive: Drive) -> list[tuple[Intervals, MarkerViews]]:
+    """Readings and views of each usable stretch of a drive, from its first reading on."""
     order = np.unique(drive.reading_stamps_ns, return_index=True)[1]
     speed, steering = drive.speed_mps[order], drive.steering_rad[order]
     good = np.isfinite(speed) & np.isfinite(steering)
     good &= ~_spikes(speed, _LEAST_SIGMA_MPS) & ~_spikes(steering, _LEAST_SIGMA_RAD)
-    stamps_ns = drive.reading_stamps_ns[order][good]
+    stamps_ns, speed, steering = drive.reading_stamps_ns[order][good], speed[good], steering[good]
     if len(stamps_ns) < _LEAST_READINGS:
         problem = f"holds {len(stamps_ns)} readings of the odometer: record the drive with them"
         raise BadInput(drive.name, problem)
-    begin_ns = stamps_ns[0]
-    readings = {
-        "time_s": (stamps_ns - begin_ns) / 1e9,
-        "speed_mps": speed[good],
-        "steering_rad": steering[good],
-    }
+    times_s, seen_s = ((of - stamps_ns[0]) / 1e9 for of in (stamps_ns, drive.view_stamps_ns))
     usable = np.isfinite(drive.corners_px).all(axis=(1, 2))
     usable &= (np.isfinite(drive.sigma_px) & (drive.sigma_px > 0)).all(axis=1)
-    views = {
-        "time_s": (drive.view_stamps_ns - begin_ns) / 1e9,
-        "camera": drive.camera,
-        "marker": drive.marker,
-        "corners_px": drive.corners_px,
-        "sigma_px": drive.sigma_px,
-    }
-    views = {name: column[usable] for name, column in views.items()}
-    views = _chosen(views, np.argsort(views["time_s"], kind="stable"))
-    cuts = np.flatnonzero(np.diff(readings["time_s"]) > GAP_S) + 1
+    in_order = np.argsort(seen_s, kind="stable")
+    in_order = in_order[usable[in_order]]
+    cuts = np.flatnonzero(np.diff(times_s) > GAP_S) + 1
     stretches = []
     for piece in np.split(np.arange(len(stamps_ns)), cuts):
-        times_s = readings["time_s"][piece]
-        inside = (views["time_s"] >= times_s[0]) & (views["time_s"] <= times_s[-1])
-        if len(piece) < _LEAST_READINGS or not inside.any():
+        begin_s, end_s = times_s[piece[[0, -1]]]
+        rows = in_order[(seen_s[in_order] >= begin_s) & (seen_s[in_order] <= end_s)]
+        if len(piece) < _LEAST_READINGS or not len(rows):
             continue
-        seen = _chosen(views, inside)
-        near = times_s >= seen["time_s"][0] - _ROOM_S
-        near &= times_s <= seen["time_s"][-1] + _ROOM_S
-        stretches.append((_chosen(readings, piece[near]), seen))
+        near = times_s[piece] >= seen_s[rows[0]] - _ROOM_S
+        kept = piece[near & (times_s[piece] <= seen_s[rows[-1]] + _ROOM_S)]
+        own_s = times_s[kept]
+        edges_s = np.concatenate([own_s[:1], (own_s[1:] + own_s[:-1]) / 2, own_s[-1:]])
+        readings = edges_s[:-1], np.diff(edges_s), speed[kept], steering[kept], np.ones(len(kept))
+        columns = (drive.camera, drive.marker, drive.corners_px, drive.sigma_px)
+        seen = (seen_s[rows], rows, rows, *(column[rows] for column in columns))
+        stretches.append((Intervals(*readings), MarkerViews(*seen)))
     return stretches
-
-
-def _chosen(columns: _Columns, rows: np.ndarray) -> _Columns:
-    return {name: column[rows] for name, column in columns.items()}
 
 
 def _spikes(values: np.ndarray, least_sigma: float) -> np.ndarray:
     """(K,) bool: true for readings far from the median of themselves and their two neighbours."""
     if not len(values):
         return np.zeros(0, bool)
-    padded = np.concatenate([values[:1], values, values[-1:]])
-    off = np.abs(values - np.median(np.stack([padded[:-2], values, padded[2:]]), axis=0))
+    off = np.abs(values - median_filter(values, 3, mode="nearest"))
     sigma = max(1.4826 * float(np.median(off)), least_sigma)
     return np.asarray(off > max(_SPIKE_SIGMAS * sigma, 0.05))

@@ -2,60 +2,47 @@
 
 The normal equations are block-tridiagonal in the nodes, with a border for the parameters. LAPACK's
 banded Cholesky eliminates the nodes and leaves the Schur complement, the parameters' information:
-the time grows with the length of the course, and not with its cube. optimistix has no solver of
-this shape: its Levenberg-Marquardt would hold a dense Jacobian of some GiB.
+the time grows with the length of the course, and not with its cube. Neither optimistix nor scipy
+has a solver of this shape: theirs hold a dense Jacobian of some GiB, or solve by iterations of
+which the long chain of nodes takes thousands a step.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solveh_banded
 
 from jaxnav.calibrate.odometry.model import NEXT, NODE, Blocks, Model
 from jaxnav.core.linalg.levenberg_marquardt import adapted
 
-_BELOW = NODE + NEXT - 1  # diagonals below the main one
+_LOCAL = NODE + NEXT  # unknowns of the nodes in an interval: side by side, from the first one's on
 _RTOL = 1e-9
 _MOST_STEPS = 100
 _PARTS = 20  # of a course, compared with each other
 _HOLDS = 1e-9  # of a pose that nothing tells of, as the last of a stretch before its first view
 
 
-@dataclass(frozen=True)
-class Prior:
-    """The prior of the parameters.
-
-    Attributes:
-        mean: (5,).
-        information: (5,), one over the variance; 0 if nothing is known.
-    """
+class Prior(NamedTuple):
+    """The prior of the parameters."""
 
     mean: Float[np.ndarray, " 5"]
-    information: Float[np.ndarray, " 5"]
+    information: Float[np.ndarray, " 5"]  # one over the variance; 0 if nothing is known
 
 
-@dataclass(frozen=True)
-class OdometryFit:
-    """The most likely course.
+class OdometryFit(NamedTuple):
+    """The most likely course."""
 
-    Attributes:
-        nodes: (N + 1, 5), x_m, y_m, psi_rad, and the errors of readings in standard deviations.
-        theta: (5,), see `model.NAMES`.
-        information: (p, p), of the free parameters, with all nodes eliminated.
-        blocks: the normal equations at this point.
-        scores: (B, p), gradient of half the cost of each part of the course by the free parameters,
-            with all nodes eliminated; they sum to zero.
-        converged: true if no step lowers the cost any more.
-    """
-
+    # x_m, y_m, psi_rad, and the errors of readings in standard deviations
     nodes: Float[np.ndarray, "nodes 5"]
-    theta: Float[np.ndarray, " 5"]
-    information: Float[np.ndarray, "p p"]
-    blocks: Blocks
+    theta: Float[np.ndarray, " 5"]  # see `model.NAMES`
+    information: Float[np.ndarray, "p p"]  # of the free parameters, with all nodes eliminated
+    blocks: Blocks  # the normal equations at this point
+    # gradient of half the cost of each part of the course by the free parameters, with all nodes
+    # eliminated; they sum to zero
     scores: Float[np.ndarray, "B p"]
-    converged: bool
+    converged: bool  # true if no step lowers the cost any more
 
 
 def fit(
@@ -71,7 +58,7 @@ def fit(
     Source: as `jaxnav.core.linalg.levenberg_marquardt`; the scaling is Marquardt's (1963).
 
     Args:
-        free: (5,) bool, true for parameters to fit; the others stay.
+        free: true for parameters to fit; the others stay.
         progress: called at every evaluation.
 
     Raises:
@@ -87,7 +74,7 @@ def fit(
     cost, blocks = evaluated(nodes, theta)
     damping, growth, converged = 1e-3, 2.0, False
     for _ in range(_MOST_STEPS):
-        system = _System.of(blocks, theta, free, prior)
+        system = System.from_blocks(blocks, theta, free, prior)
         try:
             step_nodes, step_theta, promised = system.solved(damping)
         except LinAlgError:
@@ -104,67 +91,47 @@ def fit(
             nodes, theta, blocks, cost = new_nodes, new_theta, new_blocks, new_cost
         if converged:
             break
-    system = _System.of(blocks, theta, free, prior)
+    system = System.from_blocks(blocks, theta, free, prior)
+    information, inner = system.eliminated(0.0)
     return OdometryFit(
-        nodes, theta, system.reduced(), blocks, system.scores(blocks, free), converged
+        nodes, theta, information, blocks, system.scores(blocks, free, inner), converged
     )
 
 
-@dataclass(frozen=True)
-class _System:
+class System(NamedTuple):
     """Normal equations: a band (8, 5 N), a border (5 N, p), a corner (p, p) and the gradients."""
 
-    band: np.ndarray
-    border: np.ndarray
-    corner: np.ndarray
-    gradient_nodes: np.ndarray
-    gradient_theta: np.ndarray
+    band: Float[np.ndarray, "8 n"]  # lower: [row - column, column]
+    border: Float[np.ndarray, "n p"]
+    corner: Float[np.ndarray, "p p"]
+    gradient_nodes: Float[np.ndarray, " n"]
+    gradient_theta: Float[np.ndarray, " p"]
 
     @staticmethod
-    def of(blocks: Blocks, theta: np.ndarray, free: np.ndarray, prior: Prior) -> "_System":
+    def from_blocks(blocks: Blocks, theta: np.ndarray, free: np.ndarray, prior: Prior) -> "System":
         """Assemble the normal equations from the blocks of the intervals and the prior."""
         H, g = blocks.information, blocks.gradient
-        nodes = len(H) + 1
-        own = np.zeros((nodes, NODE, NODE))
-        own[:-1] += H[:, :NODE, :NODE]
-        own[1:, :NEXT, :NEXT] += H[:, NODE : NODE + NEXT, NODE : NODE + NEXT]
-        own[:, range(NODE), range(NODE)] += _HOLDS
-        own[-1, range(NEXT, NODE), range(NEXT, NODE)] += 1.0  # the last node has no reading
-        band = np.zeros((_BELOW + 1, nodes, NODE))
-        for column in range(NODE):
-            for row in range(column, NODE):
-                band[row - column, :, column] += own[:, row, column]
-            for row in range(NEXT):
-                band[NODE + row - column, :-1, column] += H[:, NODE + row, column]
-        border = np.zeros((nodes, NODE, int(free.sum())))
-        border[:-1] += H[:, :NODE, NODE + NEXT :][:, :, free]
-        border[1:, :NEXT] += H[:, NODE : NODE + NEXT, NODE + NEXT :][:, :, free]
-        corner = H[:, NODE + NEXT :, NODE + NEXT :].sum(axis=0) + np.diag(prior.information)
-        gradient = np.zeros((nodes, NODE))
-        gradient[:-1] += g[:, :NODE]
-        gradient[1:, :NEXT] += g[:, NODE : NODE + NEXT]
-        of_theta = g[:, NODE + NEXT :].sum(axis=0) + prior.information * (theta - prior.mean)
-        return _System(
-            band.reshape(_BELOW + 1, -1),
-            border.reshape(nodes * NODE, -1),
+        first, n = NODE * np.arange(len(H))[:, None], NODE * (len(H) + 1)
+        row, column = np.tril_indices(_LOCAL)
+        at, nodes = (row - column) * n + first + column, (first + np.arange(_LOCAL)).ravel()
+
+        def of_nodes(values: np.ndarray) -> np.ndarray:
+            return np.bincount(nodes, values.ravel(), n)
+
+        band = np.bincount(at.ravel(), H[:, row, column].ravel(), _LOCAL * n)
+        band = band.astype(float).reshape(_LOCAL, n)
+        band[0] += _HOLDS
+        band[0, NEXT - NODE :] += 1.0  # the last node has no reading
+        border = [of_nodes(H[:, :_LOCAL, _LOCAL + p]) for p in np.flatnonzero(free)]
+        corner = H[:, _LOCAL:, _LOCAL:].sum(axis=0) + np.diag(prior.information)
+        of_theta = g[:, _LOCAL:].sum(axis=0) + prior.information * (theta - prior.mean)
+        return System(
+            band,
+            np.reshape(border, (-1, n)).T,
             corner[np.ix_(free, free)],
-            gradient.reshape(-1),
+            of_nodes(g[:, :_LOCAL]),
             of_theta[free],
         )
-
-    def reduced(self) -> np.ndarray:
-        """(p, p): the parameters' information with the nodes eliminated; raises as `solved`."""
-        return self._eliminated(0.0)[0]
-
-    def scores(self, blocks: Blocks, free: np.ndarray) -> np.ndarray:
-        """(B, p): the parameters' gradient by each part of the course, the nodes eliminated."""
-        inner = self._eliminated(0.0)[1][:, :-1].reshape(-1, NODE, self.border.shape[1])
-        g = blocks.gradient
-        by_nodes = np.einsum("ni,nip->np", g[:, :NODE], inner[:-1])
-        by_nodes += np.einsum("ni,nip->np", g[:, NODE : NODE + NEXT], inner[1:, :NEXT])
-        scores = g[:, NODE + NEXT :][:, free] - by_nodes
-        edges = np.linspace(0, len(scores), min(_PARTS, len(scores)), endpoint=False).astype(int)
-        return np.add.reduceat(scores, edges, axis=0)
 
     def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
         """The damped step of the nodes and of the parameters, and the decrease of the cost that the
@@ -173,24 +140,31 @@ class _System:
         Raises:
             LinAlgError: the damped equations are not positive definite.
         """
-        schur, inner = self._eliminated(damping)
+        schur, inner = self.eliminated(damping)
         right = self.border.T @ inner[:, -1] - self.gradient_theta
         theta = cho_solve(cho_factor(schur), right) if len(right) else right
         nodes = -(inner[:, -1] + inner[:, :-1] @ theta)
-        extra = damping * (
-            np.sum(self.band[0] * nodes**2) + np.sum(np.diag(self.corner) * theta**2)
-        )
-        promised = extra - self.gradient_nodes @ nodes - self.gradient_theta @ theta
+        raised = np.sum(self.band[0] * nodes**2) + np.sum(np.diag(self.corner) * theta**2)
+        promised = damping * raised - self.gradient_nodes @ nodes - self.gradient_theta @ theta
         return nodes.reshape(-1, NODE), theta, float(promised)
 
-    def _eliminated(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    def eliminated(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
         """The Schur complement, and the band's inverse times border and gradient."""
-        band, corner = self.band.copy(), self.corner.copy()
-        if not all(np.isfinite(part).all() for part in (band, self.border, corner)):
+        if not all(np.isfinite(part).all() for part in self[:3]):
             raise LinAlgError("the equations are not finite")
+        band, corner = self.band.copy(), self.corner.copy()
         band[0] *= 1 + damping
-        corner[range(len(corner)), range(len(corner))] *= 1 + damping
-        factor = cholesky_banded(band, lower=True, check_finite=False)
+        corner[np.diag_indices(len(corner))] *= 1 + damping
         right = np.column_stack([self.border, self.gradient_nodes])
-        inner = cho_solve_banded((factor, True), right, check_finite=False)
+        inner = solveh_banded(band, right, lower=True, check_finite=False)
         return corner - self.border.T @ inner[:, :-1], inner
+
+    def scores(
+        self, blocks: Blocks, free: np.ndarray, inner: np.ndarray
+    ) -> Float[np.ndarray, "B p"]:
+        """The parameters' gradient by each part of the course, the nodes eliminated."""
+        g, carried = blocks.gradient, inner[:, :-1].reshape(-1, NODE, self.border.shape[1])
+        around = np.concatenate([carried[:-1], carried[1:, :NEXT]], axis=1)
+        scores = g[:, _LOCAL:][:, free] - np.einsum("ni,nip->np", g[:, :_LOCAL], around)
+        edges = np.linspace(0, len(scores), min(_PARTS, len(scores)), endpoint=False).astype(int)
+        return np.add.reduceat(scores, edges, axis=0)

@@ -32,26 +32,19 @@ NAMES = ("speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "
 SLIP_PER_SQRT_S = (5e-4, 3e-4, 1e-3)
 # A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
 FULL_WEIGHT = 26.1
-NODE, NEXT, LOCAL = 5, 3, 13  # unknowns of an interval: of its node, of the next node, all of them
+NODE, NEXT = 5, 3  # unknowns of an interval: of its node, and of the next node; then parameters
 _PADDED = 512  # sizes are rounded up, so that drives of about one length share a program
 
 
 class Blocks(NamedTuple):
-    """Cost and normal equations at one point, interval by interval.
+    """Cost and normal equations at one point, interval by interval."""
 
-    Attributes:
-        cost: sum of squares, in which outliers count less.
-        information: (N, 13, 13), of a node (5), the next pose (3) and the parameters (5).
-        gradient: (N, 13).
-        view_chi2: (V,), of each view's eight residuals.
-        views_px: (V, 4, 2), residuals in pixels.
-    """
-
-    cost: float
+    cost: float  # sum of squares, in which outliers count less
+    # of a node (5), the next pose (3) and the parameters (5)
     information: Float[np.ndarray, "N 13 13"]
     gradient: Float[np.ndarray, "N 13"]
-    view_chi2: Float[np.ndarray, " V"]
-    views_px: Float[np.ndarray, "V 4 2"]
+    view_chi2: Float[np.ndarray, " V"]  # of each view's eight residuals
+    views_px: Float[np.ndarray, "V 4 2"]  # residuals in pixels
 
 
 class Model:
@@ -105,9 +98,9 @@ def corrected(
 def _process(local: Array, interval: Intervals, sigma: Array) -> Float[Array, " 5"]:
     """Whitened residuals: the reading's two errors, and the slip along, across and about."""
     node, following, theta = local[:NODE], local[NODE : NODE + NEXT], local[NODE + NEXT :]
-    led = _led(node, theta, interval, sigma, interval.dt_s)
+    driven = _dead_reckoned(node, theta, interval, sigma, interval.dt_s)
     cosine, sine = jnp.cos(node[2]), jnp.sin(node[2])
-    dx, dy, dpsi = following - led
+    dx, dy, dpsi = following - driven
     slip = jnp.stack([cosine * dx + sine * dy, cosine * dy - sine * dx, dpsi])
     slip = slip / (jnp.asarray(SLIP_PER_SQRT_S) * jnp.sqrt(interval.dt_s))
     return jnp.concatenate([node[3:], interval.linked * slip])
@@ -127,8 +120,8 @@ def _view(
     """
     node, following, theta = local[:NODE], local[NODE : NODE + NEXT], local[NODE + NEXT :]
     after_s = view.time_s - theta[4] - interval.begin_s
-    pose = _led(node, theta, interval, sigma, after_s)
-    slip = following - _led(node, theta, interval, sigma, interval.dt_s)
+    pose = _dead_reckoned(node, theta, interval, sigma, after_s)
+    slip = following - _dead_reckoned(node, theta, interval, sigma, interval.dt_s)
     pose = pose + interval.linked * (after_s / interval.dt_s) * slip
     T_vehicle_world = T_world_vehicle_from_planar(pose).inverse()
     points_vehicle = transform_points(T_vehicle_world, markers.corners_world_m[view.marker])
@@ -138,7 +131,9 @@ def _view(
     return (pixels - view.corners_px).reshape(8)
 
 
-def _led(node: Array, theta: Array, interval: Intervals, sigma: Array, dt_s: Array) -> Array:
+def _dead_reckoned(
+    node: Array, theta: Array, interval: Intervals, sigma: Array, dt_s: Array
+) -> Array:
     """The pose by odometry after the time dt_s of an interval."""
     errors = sigma * node[3:]
     speed_mps, steering_rad = corrected(

@@ -43,8 +43,8 @@ def start(
         error: of the odometry with these parameters, as a part of what it drove and turned.
     """
     times_s = course.node_times_s
-    led = _led(course.intervals, theta)
-    chosen, good = _branches(course, rig, markers, theta, times_s, led, error)
+    driven = _dead_reckoned(course.intervals, theta)
+    chosen, good = _branches(course, rig, markers, theta, times_s, driven, error)
     seen_s = course.views.time_s - theta[4]
     nodes = np.zeros((len(times_s), NODE))
     begins = np.concatenate([[0], np.flatnonzero(course.intervals.linked == 0) + 1])
@@ -54,27 +54,26 @@ def start(
         if not own.any():
             own = course.views.first == begin
         anchor_s, poses = _thinned(seen_s[own], chosen[own])
-        nodes[begin:end, :3] = _bent(times_s[begin:end], led[begin:end], anchor_s, poses)
+        nodes[begin:end, :3] = _bent(times_s[begin:end], driven[begin:end], anchor_s, poses)
     return nodes
 
 
-def _led(intervals: Intervals, theta: np.ndarray) -> np.ndarray:
+def _dead_reckoned(intervals: Intervals, theta: np.ndarray) -> np.ndarray:
     """(N + 1, 3): poses by odometry alone, from the origin."""
+    columns = Intervals(*padded(intervals))  # drives of about one length share a program
+    speed, steering = corrected(jnp.asarray(theta), columns.speed_mps, columns.steering_rad)
+    dt_s = np.where(columns.linked > 0, columns.dt_s, 0.0)
+    moved = np.asarray(_advanced(speed, steering, jnp.asarray(dt_s), jnp.asarray(theta[3])))
+    return np.concatenate([np.zeros((1, 3)), moved[: len(intervals.dt_s)]])
 
-    @jax.jit
-    def run(speed: Array, steering: Array, dt_s: Array, wheelbase_m: Array) -> Array:
-        def one(pose: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            moved = advance_bicycle(pose, *row, wheelbase_m)
-            return moved, moved
 
-        return jax.lax.scan(one, jnp.zeros(3), (speed, steering, dt_s))[1]
+@jax.jit
+def _advanced(speed: Array, steering: Array, dt_s: Array, wheelbase_m: Array) -> Array:
+    def one(pose: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        moved = advance_bicycle(pose, *row, wheelbase_m)
+        return moved, moved
 
-    extra = -len(intervals.dt_s) % 512  # drives of about one length share a program
-    speed, steering = corrected(jnp.asarray(theta), intervals.speed_mps, intervals.steering_rad)
-    columns = (speed, steering, np.where(intervals.linked > 0, intervals.dt_s, 0.0))
-    rows = [jnp.asarray(np.pad(column, (0, extra))) for column in columns]
-    moved = np.asarray(run(*rows, jnp.asarray(theta[3])))[: len(intervals.dt_s)]
-    return np.concatenate([np.zeros((1, 3)), moved])
+    return jax.lax.scan(one, jnp.zeros(3), (speed, steering, dt_s))[1]
 
 
 def _branches(
@@ -83,14 +82,14 @@ def _branches(
     markers: MarkerMap,
     theta: np.ndarray,
     times_s: np.ndarray,
-    led: np.ndarray,
+    driven: np.ndarray,
     error: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(V, 3): one of the two poses of each view, by the least total cost; and (V,), true where it
     fits one of its neighbours."""
     views = course.views
     poses, cost = _both_poses(views, rig, markers)
-    at = np.column_stack([np.interp(views.time_s - theta[4], times_s, c) for c in led.T])
+    at = np.column_stack([np.interp(views.time_s - theta[4], times_s, c) for c in driven.T])
     new = np.concatenate([[True], np.diff(views.first) != 0])
     total, came = cost[0], np.zeros((len(at), 2), int)
     steps = np.zeros((len(at), 2, 2))
@@ -158,11 +157,11 @@ def _step_cost(
 ) -> np.ndarray:
     """(2, 2): costs of the steps from each of two poses to each of the next two, by odometry."""
     turn = b[2] - a[2]
-    led_m = _turned(b[:2] - a[:2], -a[2])
+    driven_m = _turned(b[:2] - a[:2], -a[2])
     seen_m = _turned(afters[None, :, :2] - befores[:, None, :2], -befores[:, None, 2])
-    off_m = np.linalg.norm(seen_m - led_m, axis=-1)
+    off_m = np.linalg.norm(seen_m - driven_m, axis=-1)
     off_rad = np.abs(wrap_angle_np(afters[None, :, 2] - befores[:, None, 2] - turn))
-    off_m = off_m / (_STEP_M + error * float(np.linalg.norm(led_m)))
+    off_m = off_m / (_STEP_M + error * float(np.linalg.norm(driven_m)))
     off_rad = off_rad / (_STEP_RAD + error * abs(turn))
     return np.asarray(np.minimum(off_m**2 + off_rad**2, _MOST))
 
@@ -179,10 +178,10 @@ def _thinned(times_s: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _bent(
-    times_s: np.ndarray, led: np.ndarray, anchor_s: np.ndarray, poses: np.ndarray
+    times_s: np.ndarray, driven: np.ndarray, anchor_s: np.ndarray, poses: np.ndarray
 ) -> np.ndarray:
     """(n, 3): the course by odometry, bent so that it goes through the anchors."""
-    at = np.column_stack([np.interp(anchor_s, times_s, column) for column in led.T])
+    at = np.column_stack([np.interp(anchor_s, times_s, column) for column in driven.T])
     # Whole turns that only the odometry measured, between views, count too.
     psi = poses[:, 2] + 2 * np.pi * np.cumsum(
         np.round(np.diff(at[:, 2] - poses[:, 2], prepend=at[0, 2] - poses[0, 2]) / (2 * np.pi))
@@ -192,8 +191,8 @@ def _bent(
 
     def from_anchor(rows: np.ndarray) -> np.ndarray:
         turn = psi[rows] - at[rows, 2]
-        moved = _turned(led[:, :2] - at[rows, :2], turn)
-        return np.column_stack([poses[rows, :2] + moved, led[:, 2] + turn])
+        moved = _turned(driven[:, :2] - at[rows, :2], turn)
+        return np.column_stack([poses[rows, :2] + moved, driven[:, 2] + turn])
 
     span = np.maximum(anchor_s[following] - anchor_s[leg], 1e-9)
     share = np.clip((times_s - anchor_s[leg]) / span, 0.0, 1.0)[:, None]

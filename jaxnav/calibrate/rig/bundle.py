@@ -16,10 +16,10 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
-from jaxnav.calibrate.rig.pose_arrays import retracted
+from jaxnav.calibrate.lens.bundle import retracted
 from jaxnav.calibrate.rig.views import RigViews
 from jaxnav.core.linalg.schur import Blocks, ReducedSystem, SchurLM, reduce
-from jaxnav.core.linalg.small_matrices import cho_solve, cholesky
+from jaxnav.core.linalg.small_matrices import cho_solve, cholesky, solve_upper
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import rotation_matrix, skew
 from jaxnav.core.models.rig import CameraRig
@@ -102,6 +102,7 @@ class Adjusted(eqx.Module):
     weight: Float[Array, " N"]  # of each sighting; 1 if it counts in full
     reduced: ReducedSystem  # of the weighted problem, undamped
     scores: Float[Array, "B R"]  # of every part of the recording, see `_scores`
+    frames_follow: Float[Array, "F 6 R"]  # derivatives of the frames' twists by the shared unknowns
     converged: Bool[Array, ""]
 
 
@@ -126,12 +127,14 @@ def adjust(
         fn, solver, start, known, has_aux=True, max_steps=max_steps, throw=False
     )
     residuals = reprojection_residuals_px(solution.value, known)
+    reduced = reduce(solution.state.normal, free, jnp.zeros(()))
     return Adjusted(
         poses=solution.value,
         residuals_px=residuals,
         weight=_weight(_distance2(residuals, known.sigma_px)),
-        reduced=reduce(solution.state.normal, free, jnp.zeros(())),
+        reduced=reduced,
         scores=_scores(solution.value, known, solution.state.normal, parts),
+        frames_follow=-jax.vmap(solve_upper)(reduced.factor, reduced.carried),
         converged=jnp.asarray(solution.result == optx.RESULTS.successful),
     )
 

@@ -6,22 +6,25 @@ residuals. Then every frame and every marker is tried at the other poses that it
 until no other pose is better.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from jaxnav.calibrate.parts import variance_inflation
 from jaxnav.calibrate.rig import bundle
-from jaxnav.calibrate.rig.branches import other_branches
 from jaxnav.calibrate.rig.linking import Linker, Links
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, matrices, wxyz_xyz
-from jaxnav.calibrate.rig.views import RigViews, both_poses, rays_camera
-from jaxnav.core.linalg.schur import ReducedSystem
-from jaxnav.core.linalg.small_matrices import solve_upper
+from jaxnav.calibrate.rig.views import (
+    RigViews,
+    Ts_vehicle_camera,
+    both_poses,
+    inverted,
+    matrices,
+    rays_camera,
+    wxyz_xyz,
+)
 from jaxnav.core.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
@@ -29,47 +32,35 @@ from jaxnav.errors import BadInput
 _LEAST_SIGMA_PX = 1e-3  # for corners that are exact
 _SAME_SCALE = 0.02  # the estimate of the noise has settled when it changes by no more
 _ROUNDS, _STEPS = 8, 30
+_BETTER = 1.0  # a pose is replaced if another lowers its cost by more than this
+_TRIES = 10  # sightings of a marker that propose its pose
 _PARTS = 40  # of a recording, compared with each other
 _NOTICED = 1.3  # a smaller inflation of the variances counts as none: 40 parts tell no better
 
 
 @dataclass(frozen=True)
 class RigCalibration:
-    """The calibrated poses of cameras and markers, with their covariance and residuals.
+    """The calibrated poses of cameras and markers, with their covariance and residuals."""
 
-    Attributes:
-        views: the sightings used; its frames are those with a pose.
-        Ts_vehicle_camera: (C, 4, 4); as given for a camera that is not `calibrated`.
-        Ts_world_marker: (M, 4, 4), of all markers of `views`.
-        Ts_world_vehicle: (F, 4, 4), the vehicle's pose in every frame.
-        calibrated: (C,) true for cameras linked to the reference camera.
-        mapped: (M,) true for markers linked to the known ones.
-        sigma_px: standard deviation of a corner's coordinate, from the residuals.
-        residuals_px: (N, 4, 2) projected minus observed.
-        weight: (N,), 1 if a sighting counts in full.
-        cameras: the cameras with their lenses, as given unless they were to be refined.
-        covariance: (6 S, 6 S) of the twists xi in T * cay(xi) of T_vehicle_camera and
-            T_world_marker and of the lenses, see `bundle.RigUnknowns`; zero for whatever was given.
-        frames_follow: (F, 6, 6 S) derivatives of the frames' twists by those unknowns.
-        inflation: factor of the covariance over that from noise independent between frames; 1 if
-            there is no other noise.
-        turned: how many frames and markers changed their branch after the first adjustment.
-    """
-
-    views: RigViews
+    views: RigViews  # the sightings used; its frames are those with a pose
+    # as given for a camera that is not `calibrated`
     Ts_vehicle_camera: Float[np.ndarray, "C 4 4"]
-    Ts_world_marker: Float[np.ndarray, "M 4 4"]
-    Ts_world_vehicle: Float[np.ndarray, "F 4 4"]
-    calibrated: Bool[np.ndarray, " C"]
-    mapped: Bool[np.ndarray, " M"]
-    cameras: Camera
-    sigma_px: float
-    residuals_px: Float[np.ndarray, "N 4 2"]
-    weight: Float[np.ndarray, " N"]
+    Ts_world_marker: Float[np.ndarray, "M 4 4"]  # of all markers of `views`
+    Ts_world_vehicle: Float[np.ndarray, "F 4 4"]  # the vehicle's pose in every frame
+    calibrated: Bool[np.ndarray, " C"]  # true for cameras linked to the reference camera
+    mapped: Bool[np.ndarray, " M"]  # true for markers linked to the known ones
+    cameras: Camera  # the cameras with their lenses, as given unless they were to be refined
+    sigma_px: float  # standard deviation of a corner's coordinate, from the residuals
+    residuals_px: Float[np.ndarray, "N 4 2"]  # projected minus observed
+    weight: Float[np.ndarray, " N"]  # 1 if a sighting counts in full
+    # of the twists xi in T * cay(xi) of T_vehicle_camera and T_world_marker and of the lenses, see
+    # `bundle.RigUnknowns`; zero for whatever was given
     covariance: Float[np.ndarray, "R R"]
-    frames_follow: Float[np.ndarray, "F 6 R"]
+    frames_follow: Float[np.ndarray, "F 6 R"]  # derivatives of the frames' twists by those unknowns
+    # factor of the covariance over that from noise independent between frames; 1 if there is no
+    # other noise
     inflation: float
-    turned: int
+    turned: int  # how many frames and markers changed their branch after the first adjustment
 
     def rms_px(self) -> float:
         """RMS residual of a corner's coordinate over all sightings, outliers included, px."""
@@ -113,22 +104,42 @@ def calibrate_rig(
         BadInput: no sighting defines the world frame, or no camera can be linked.
     """
     start = _start(views, rig, known, reference_camera, refine_lenses)
-    views, free = start.linker.views, start.free
-    poses, turned, adjusted = start.poses, 0, None
-    sigma_px = bundle.sigma_px_of(
-        np.asarray(bundle.reprojection_residuals_px(poses, bundle.seen(rig, views, 1.0)))
-    )
+    views, free, poses, turned = start.linker.views, start.free, start.poses, 0
+    start_px = bundle.reprojection_residuals_px(poses, bundle.seen(rig, views, 1.0))
+    sigma_px = bundle.sigma_px_of(np.asarray(start_px))
     for _ in range(_ROUNDS):
         adjusted, used_px = _adjusted(rig, views, poses, free, sigma_px)
-        sigma_px = bundle.sigma_px_of(np.asarray(adjusted.residuals_px))
-        poses, changed = other_branches(
-            rig, start.linker, start.links, adjusted.poses, free, sigma_px
-        )
+        residuals_px = np.asarray(adjusted.residuals_px)
+        sigma_px = bundle.sigma_px_of(residuals_px)
+        poses, changed = _other_branches(rig, start, adjusted.poses, sigma_px)
         turned += changed
         if not changed:
             break
-    assert adjusted is not None  # there is a round
-    return _calibration(rig, start, adjusted, used_px, turned)
+    count = int(free.sum())
+    inverse = np.linalg.inv(np.asarray(adjusted.reduced.system))
+    inverse = np.where(free[:, None] & free[None], (inverse + inverse.T) / 2, 0)
+    # The fitted unknowns have taken up their part of the noise.
+    left = max(residuals_px.size - 6 * views.frames - count, 1) / residuals_px.size
+    sigma_px /= np.sqrt(left)
+    inflation = variance_inflation(np.asarray(adjusted.scores), inverse, count, _NOTICED)
+    found = adjusted.poses
+    found_cameras = matrices(found.Ts_vehicle_camera)
+    return RigCalibration(
+        views=views,
+        Ts_vehicle_camera=np.where(start.calibrated[:, None, None], found_cameras, start.given),
+        Ts_world_marker=matrices(found.Ts_world_marker),
+        Ts_world_vehicle=matrices(found.Ts_world_vehicle),
+        calibrated=start.calibrated,
+        mapped=start.mapped,
+        cameras=bundle.with_lenses(rig.cameras, found.lenses) if refine_lenses else rig.cameras,
+        sigma_px=sigma_px,
+        residuals_px=residuals_px,
+        weight=np.asarray(adjusted.weight),
+        covariance=inverse * (sigma_px / used_px) ** 2 * inflation,
+        frames_follow=np.asarray(adjusted.frames_follow),
+        inflation=inflation,
+        turned=turned,
+    )
 
 
 @dataclass(frozen=True)
@@ -139,7 +150,7 @@ class _Start:
     given: np.ndarray  # (C, 4, 4), T_vehicle_camera
     calibrated: np.ndarray
     mapped: np.ndarray
-    free: np.ndarray  # (S, 6), mask of the shared unknowns that move, see `bundle.RigUnknowns`
+    free: np.ndarray  # (6 S,), mask of the shared unknowns that move, see `bundle.RigUnknowns`
 
 
 def _start(
@@ -180,31 +191,23 @@ def _start(
     linker = linker.only(rows)
     Ts_vehicle_world = linker.sights(links).Ts_cameras_markers[:, 0]
     C, M = len(rig), len(views.size_m)
-    sixes = (C, M, 2 * C if refine_lenses else 0)
-    free_cameras, free_markers, free_lenses = (np.zeros((count, 6), bool) for count in sixes)
+    free = np.zeros((C + M + (2 * C if refine_lenses else 0), 6), bool)
     if reference_camera is not None:
-        free_cameras[calibrated] = True
-        free_cameras[reference_camera] = False
-    free_markers[mapped] = True
-    free_markers[anchors] = False
+        free[:C][calibrated] = True
+        free[reference_camera] = False
+    free[C : C + M][mapped] = True
+    free[C + np.array(anchors)] = False
     for index in np.flatnonzero(calibrated) if refine_lenses else ():
         lens = rig.cameras.lenses[int(rig.cameras.lens_index[index])]
         figures = np.arange(12) < 4 + LENS_COEFFICIENTS[lens]
-        free_lenses[index], free_lenses[C + index] = figures[:6], figures[6:]
-    return _Start(
-        links,
-        linker,
-        bundle.RigUnknowns(
-            wxyz_xyz(inverted(Ts_vehicle_world)),
-            wxyz_xyz(np.where(calibrated[:, None, None], links.Ts_group_camera, given)),
-            wxyz_xyz(links.Ts_group_marker),
-            bundle.lenses_of(rig.cameras)[: C if refine_lenses else 0],
-        ),
-        given,
-        calibrated,
-        mapped,
-        np.concatenate([free_cameras, free_markers, free_lenses]),
+        free[C + M + index], free[2 * C + M + index] = figures[:6], figures[6:]
+    poses = bundle.RigUnknowns(
+        wxyz_xyz(inverted(Ts_vehicle_world)),
+        wxyz_xyz(np.where(calibrated[:, None, None], links.Ts_group_camera, given)),
+        wxyz_xyz(links.Ts_group_marker),
+        bundle.lenses_of(rig.cameras)[: C if refine_lenses else 0],
     )
+    return _Start(links, linker, poses, given, calibrated, mapped, free.ravel())
 
 
 def _adjusted(
@@ -214,13 +217,7 @@ def _adjusted(
     for _ in range(_ROUNDS):
         used_px = max(sigma_px, _LEAST_SIGMA_PX)
         known = bundle.seen(rig, views, used_px)
-        adjusted = bundle.adjust(
-            poses,
-            known,
-            jnp.asarray(free.reshape(-1)),
-            parts=min(_PARTS, views.frames),
-            max_steps=_STEPS,
-        )
+        adjusted = bundle.adjust(poses, known, jnp.asarray(free), min(_PARTS, views.frames), _STEPS)
         poses = adjusted.poses
         sigma_px = bundle.sigma_px_of(np.asarray(adjusted.residuals_px))
         if abs(sigma_px - used_px) <= _SAME_SCALE * used_px and bool(adjusted.converged):
@@ -228,42 +225,60 @@ def _adjusted(
     return adjusted, used_px
 
 
-def _calibration(
-    rig: CameraRig, start: _Start, adjusted: bundle.Adjusted, used_px: float, turned: int
-) -> RigCalibration:
-    views, flat = start.linker.views, start.free.reshape(-1)
-    inverse = np.linalg.inv(np.asarray(adjusted.reduced.system))
-    inverse = np.where(flat[:, None] & flat[None], (inverse + inverse.T) / 2, 0)
-    residuals = np.asarray(adjusted.residuals_px)
-    unknowns = 6 * views.frames + int(flat.sum())
-    # The fitted unknowns have taken up their part of the noise.
-    left = max(residuals.size - unknowns, 1) / residuals.size
-    sigma_px = bundle.sigma_px_of(residuals) / np.sqrt(left)
-    scores = np.asarray(adjusted.scores)
-    inflation = variance_inflation(scores, inverse, int(flat.sum()), _NOTICED)
-    lenses = adjusted.poses.lenses
-    return RigCalibration(
-        views=views,
-        Ts_vehicle_camera=np.where(
-            start.calibrated[:, None, None],
-            matrices(adjusted.poses.Ts_vehicle_camera),
-            start.given,
-        ),
-        Ts_world_marker=matrices(adjusted.poses.Ts_world_marker),
-        Ts_world_vehicle=matrices(adjusted.poses.Ts_world_vehicle),
-        calibrated=start.calibrated,
-        mapped=start.mapped,
-        cameras=bundle.with_lenses(rig.cameras, lenses) if len(lenses) else rig.cameras,
-        sigma_px=sigma_px,
-        residuals_px=residuals,
-        weight=np.asarray(adjusted.weight),
-        covariance=inverse * (sigma_px / used_px) ** 2 * inflation,
-        frames_follow=np.asarray(_follows(adjusted.reduced)),
-        inflation=inflation,
-        turned=turned,
+def _other_branches(
+    rig: CameraRig, start: _Start, poses: bundle.RigUnknowns, sigma_px: float
+) -> tuple[bundle.RigUnknowns, int]:
+    """Move frames and markers to other poses that their sightings admit, if those cost less; and
+    say how many have moved.
+
+    A frame has two possible poses, and a marker two for each of some sightings. A search that
+    begins at a mirrored pose ends there, and only a comparison of costs tells.
+    """
+    C, linker, links = len(rig), start.linker, start.links
+    views, M = linker.views, len(linker.views.size_m)
+    links.Ts_group_camera[:] = matrices(poses.Ts_vehicle_camera)
+    links.Ts_group_marker[:] = matrices(poses.Ts_world_marker)
+    known = bundle.seen(rig, views, sigma_px)
+
+    def cost(of: bundle.RigUnknowns, groups: np.ndarray, count: int) -> np.ndarray:
+        residuals = np.asarray(bundle.reprojection_residuals_px(of, known))
+        return np.bincount(groups, bundle.losses(residuals, float(known.sigma_px)), count)
+
+    def best_of(
+        of: bundle.RigUnknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]
+    ) -> tuple[bundle.RigUnknowns, int]:
+        """Replace each of the named poses by the one that costs its sightings least."""
+        best, changed = matrices(getattr(of, name)), 0
+        least = cost(of, groups, len(best))
+        for tried in tries:
+            costs = cost(replace(of, **{name: wxyz_xyz(tried)}), groups, len(best))
+            better = costs < least - _BETTER
+            changed += int(better.sum())
+            best[better] = tried[better]
+            least = np.minimum(least, costs)
+        return replace(of, **{name: wxyz_xyz(best)}), changed
+
+    candidates = inverted(linker.sights(links).Ts_cameras_markers)
+    poses, frames = best_of(
+        poses, "Ts_world_vehicle", views.frame, (candidates[:, branch] for branch in (0, 1))
     )
 
-
-@jax.jit
-def _follows(reduced: ReducedSystem) -> Array:
-    return -jax.vmap(solve_upper)(reduced.factor, reduced.carried)
+    Ts_world_marker, Ts_world_vehicle, Ts_vehicle_camera = (
+        matrices(Ts)
+        for Ts in (poses.Ts_world_marker, poses.Ts_world_vehicle, poses.Ts_vehicle_camera)
+    )
+    Ts_world_camera = Ts_world_vehicle[views.frame] @ Ts_vehicle_camera[views.camera]
+    proposed = Ts_world_camera[:, None] @ linker.Ts_camera_marker
+    # (tries, M) rows of each marker's sightings, spread over the recording; -1 if it has none.
+    spread = np.full((_TRIES, M), -1)
+    for index in np.flatnonzero(start.free.reshape(-1, 6)[C : C + M, 0]):
+        rows = np.flatnonzero(views.marker == index)
+        if len(rows):
+            spread[:, index] = rows[np.linspace(0, len(rows) - 1, _TRIES).astype(int)]
+    tries = (
+        np.where((row >= 0)[:, None, None], proposed[row, branch], Ts_world_marker)
+        for row in spread
+        for branch in (0, 1)
+    )
+    poses, markers = best_of(poses, "Ts_world_marker", views.marker, tries)
+    return poses, frames + markers

@@ -10,14 +10,15 @@ After Ch'ng, Sogi, Latif, Reid, Chin (2020), "Resolving marker pose ambiguity by
 averaging with clique constraints", who ask the same consistency of rotations alone.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxnav.calibrate.rig.pose_arrays import inverted, turn_rad
-from jaxnav.calibrate.rig.views import RigViews
+from jaxnav.calibrate.rig.views import RigViews, inverted, turn_rad
 
 _NEAR_RAD = 0.03  # error of a corner predicted through a link at which its vote counts half
 _DISTINCT_RAD = np.deg2rad(10)  # least turn between two different candidates
@@ -26,84 +27,46 @@ _VOTERS = 30  # frames that vote on a link
 # Links are made in rounds: least votes beside the proposer's, and least part of all voters.
 _ROUNDS = ((5.0, 0.5), (2.0, 0.3), (0.5, 0.0), (0.0, 0.0))
 
-# Votes, number of frames that see both, the two groups a and b, and T_a_b.
-Proposal = tuple[float, int, int, int, Float[np.ndarray, "4 4"]]
-
 
 @dataclass
 class Links:
-    """Groups of cameras and groups of markers, with known relative poses within each group.
-
-    Attributes:
-        group_of_camera: (C,), group_of_marker: (M,): the group of each.
-        Ts_group_camera: (C, 4, 4), pose of each camera in the frame of its group.
-        Ts_group_marker: (M, 4, 4), pose of each marker in the frame of its group.
-    """
+    """Groups of cameras and groups of markers, with known relative poses within each group."""
 
     group_of_camera: Int[np.ndarray, " C"]
-    Ts_group_camera: Float[np.ndarray, "C 4 4"]
+    Ts_group_camera: Float[np.ndarray, "C 4 4"]  # pose of each camera in the frame of its group
     group_of_marker: Int[np.ndarray, " M"]
-    Ts_group_marker: Float[np.ndarray, "M 4 4"]
+    Ts_group_marker: Float[np.ndarray, "M 4 4"]  # pose of each marker in the frame of its group
 
     @staticmethod
     def none(cameras: int, markers: int) -> "Links":
         """Links with every camera and every marker in a group of its own."""
-        return Links(
-            np.arange(cameras),
-            np.tile(np.eye(4), (cameras, 1, 1)),
-            np.arange(markers),
-            np.tile(np.eye(4), (markers, 1, 1)),
-        )
-
-    def join_cameras(self, a: int, b: int, T_a_b: Float[np.ndarray, "4 4"]) -> None:
-        """Merge the group b of cameras into the group a."""
-        _merge(self.group_of_camera, self.Ts_group_camera, a, b, T_a_b)
-
-    def join_markers(self, a: int, b: int, T_a_b: Float[np.ndarray, "4 4"]) -> None:
-        """Merge the group b of markers into the group a."""
-        _merge(self.group_of_marker, self.Ts_group_marker, a, b, T_a_b)
-
-
-def _merge(groups: np.ndarray, Ts: np.ndarray, a: int, b: int, T_a_b: np.ndarray) -> None:
-    inside = groups == b
-    Ts[inside] = T_a_b @ Ts[inside]
-    groups[inside] = a
+        Ts_camera, Ts_marker = (np.tile(np.eye(4), (count, 1, 1)) for count in (cameras, markers))
+        return Links(np.arange(cameras), Ts_camera, np.arange(markers), Ts_marker)
 
 
 @dataclass(frozen=True)
 class Sights:
-    """S sights, each of one group of markers by one group of cameras in one frame.
+    """S sights, each of one group of markers by one group of cameras in one frame."""
 
-    Attributes:
-        frame, cameras, markers: (S,) the frame and both groups.
-        Ts_cameras_markers: (S, 2, 4, 4), the most likely pose and the next that differs from it.
-        row: (S,) index of the sighting that appears largest.
-    """
-
-    frame: Int[np.ndarray, " S"]
+    frame: Int[np.ndarray, " S"]  # the frame, and both groups
     cameras: Int[np.ndarray, " S"]
     markers: Int[np.ndarray, " S"]
+    # the most likely pose and the next that differs from it
     Ts_cameras_markers: Float[np.ndarray, "S 2 4 4"]
-    row: Int[np.ndarray, " S"]
+    row: Int[np.ndarray, " S"]  # index of the sighting that appears largest
 
 
+@dataclass(frozen=True)
 class Linker:
     """Links cameras and markers by the sightings of a recording."""
 
-    def __init__(
-        self,
-        views: RigViews,
-        rays: Float[np.ndarray, "N 4 3"],
-        Ts_camera_marker: Float[np.ndarray, "N 2 4 4"],
-    ):
-        """Args:
-        rays: (N, 4, 3), unit rays through the corners, in the camera's frame.
-        Ts_camera_marker: (N, 2, 4, 4), both poses of every sighting.
-        """
-        self.views, self.rays = views, rays
-        self.Ts_camera_marker = Ts_camera_marker
-        self.corners = views.corners_marker_m()
-        self.width_rad = np.linalg.norm(rays[:, 0] - rays[:, 2], axis=1)
+    views: RigViews
+    rays: Float[np.ndarray, "N 4 3"]  # unit rays through the corners, in the camera's frame
+    Ts_camera_marker: Float[np.ndarray, "N 2 4 4"]  # both poses of every sighting
+
+    @cached_property
+    def _corners(self) -> Float[np.ndarray, "N 4 3"]:
+        return self.views.corners_marker_m()
 
     def only(self, kept: Bool[np.ndarray, " N"]) -> "Linker":
         """The linker of these rows alone."""
@@ -121,34 +84,25 @@ class Linker:
                 pass
 
     def _link_all(self, links: Links, least: float, part: float) -> bool:
-        def alone(groups: np.ndarray) -> bool:
-            return len(np.unique(groups)) == 1
-
-        if alone(links.group_of_camera) and alone(links.group_of_marker):
+        """Link markers, then cameras, that enough frames agree on; true if any link is new."""
+        if all(len(np.unique(of)) == 1 for of in (links.group_of_camera, links.group_of_marker)):
             return False
-        markers = self._link_markers(links, least, part)
-        return self._link_cameras(links, least, part) or markers
-
-    def _link_markers(self, links: Links, least: float, part: float) -> bool:
-        sights = self.sights(links)
-        proposals = []
-        for (a, b), x, y in _together(sights.frame, sights.cameras, sights.markers):
-            T, votes = self._vote(links, sights, x, y, inverse=False)
-            proposals.append((votes, len(x), a, b, T))
-        return _join(proposals, least, part, links.join_markers)
-
-    def _link_cameras(self, links: Links, least: float, part: float) -> bool:
-        sights = self.sights(links)
-        voted: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
-        # Each group of markers that both cameras saw votes on its own.
-        for (a, b), x, y in _together(sights.frame, sights.markers, sights.cameras):
-            voted.setdefault((a, b), []).append((x, y))
-        proposals = []
-        for (a, b), parts in voted.items():
-            x, y = (np.concatenate(side) for side in zip(*parts, strict=True))
-            T, votes = self._vote(links, sights, x, y, inverse=True)
-            proposals.append((votes, len(x), a, b, T))
-        return _join(proposals, least, part, links.join_cameras)
+        any_new = False
+        for cameras in (False, True):
+            sights = self.sights(links)
+            seer, seen = sights.cameras, sights.markers
+            groups, Ts = links.group_of_marker, links.Ts_group_marker
+            if cameras:
+                seer, seen = seen, seer
+                groups, Ts = links.group_of_camera, links.Ts_group_camera
+            proposals = []
+            for (a, b), x, y in _together(sights.frame, seer, seen):
+                T_a_b, votes = self._vote(links, sights, x, y, inverse=cameras)
+                voters = min(len(x), _VOTERS)
+                if votes >= least and (voters == 1 or votes >= part * (voters - 1)):
+                    proposals.append((votes, a, b, T_a_b))
+            any_new |= _join(groups, Ts, proposals)
+        return any_new
 
     def _vote(
         self, links: Links, sights: Sights, x: np.ndarray, y: np.ndarray, inverse: bool
@@ -156,7 +110,7 @@ class Linker:
         """T_x_y that most frames agree with, and the votes for it besides its proposer's.
 
         Args:
-            x, y: (n,) corresponding rows of `sights` of the two groups to be linked.
+            x, y: rows of `sights` that belong together, of the two groups to be linked.
             inverse: true if the groups are cameras, false if they are markers.
         """
         pick = np.unique(np.linspace(0, len(x) - 1, min(len(x), _VOTERS)).astype(int))
@@ -171,10 +125,8 @@ class Linker:
         error = self._error_rad(links, sights.row[y][:, None, None], predicted).min(axis=1)
         agreement = _agreement(error)
         # A proposer's vote for itself doesn't count.
-        votes = (
-            agreement.sum(axis=0)
-            - agreement[np.repeat(np.arange(len(x)), 4), np.arange(4 * len(x))]
-        )
+        proposer = np.repeat(np.arange(len(x)), 4)
+        votes = agreement.sum(axis=0) - agreement[proposer, np.arange(4 * len(x))]
         best = int(np.argmax(votes))
         return proposed[best], float(votes[best])
 
@@ -193,17 +145,15 @@ class Linker:
         )
         # Every candidate of a group against every sighting of it.
         count = np.bincount(group)
-        i = np.repeat(np.arange(len(order)), count[group])
-        j = (
-            first[group[i]]
-            + np.arange(len(i))
-            - np.repeat(np.cumsum(count[group]) - count[group], count[group])
-        )
+        size = count[group]
+        i = np.repeat(np.arange(len(order)), size)
+        j = first[group[i]] + np.arange(len(i)) - np.repeat(np.cumsum(size) - size, size)
         error = self._error_rad(links, order[j][:, None], Ts[order[i]])
         votes = np.zeros((len(order), 2))
         np.add.at(votes, i, _agreement(error))
         chosen = np.zeros((len(first), 2, 4, 4))
         rows = np.zeros(len(first), int)
+        width_rad = np.linalg.norm(self.rays[:, 0] - self.rays[:, 2], axis=1)
         for g, start in enumerate(first):
             inside = order[start : start + count[g]]
             candidates, score = (
@@ -214,7 +164,7 @@ class Linker:
             other = turn_rad(candidates[best], candidates) > _DISTINCT_RAD
             second = int(np.argmax(np.where(other, score, -1))) if other.any() else best
             chosen[g] = candidates[best], candidates[second]
-            rows[g] = inside[np.argmax(self.width_rad[inside])]
+            rows[g] = inside[np.argmax(width_rad[inside])]
         of = order[first]
         return Sights(views.frame[of], cameras[of], markers[of], chosen, rows)
 
@@ -224,7 +174,7 @@ class Linker:
         views = self.views
         T_camera_cameras = inverted(links.Ts_group_camera)[views.camera[row]]
         T = T_camera_cameras @ Ts @ links.Ts_group_marker[views.marker[row]]
-        points = self.corners[row] @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+        points = self._corners[row] @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
         points /= np.linalg.norm(points, axis=-1, keepdims=True)
         squared = np.sum((points - self.rays[row]) ** 2, axis=-1)
         return np.asarray(np.sqrt(np.mean(squared, axis=-1)))
@@ -234,51 +184,43 @@ def _together(
     frame: np.ndarray, seer: np.ndarray, seen: np.ndarray
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray]]:
     """Yield pairs that one seer sees in the same frames: (a, b), rows of a, rows of b; a < b."""
-    order = np.lexsort([seen, seer, frame])
-    pairs: dict[tuple[int, int], tuple[list[int], list[int]]] = {}
-    starts = np.flatnonzero(
-        np.any(np.diff(np.stack([frame, seer])[:, order], axis=1, prepend=-1), axis=0)
-    )
-    for start, end in zip(starts, [*starts[1:], len(order)], strict=True):
-        rows = order[start:end]
-        for index, x in enumerate(rows):
-            for y in rows[index + 1 :]:
-                xs, ys = pairs.setdefault((int(seen[x]), int(seen[y])), ([], []))
-                xs.append(int(x))
-                ys.append(int(y))
-    for pair, (xs, ys) in pairs.items():
-        yield pair, np.array(xs), np.array(ys)
+    sights: dict[tuple[int, int], list[int]] = {}
+    for row in np.lexsort([seen, seer, frame]):
+        sights.setdefault((int(frame[row]), int(seer[row])), []).append(int(row))
+    pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for rows in sights.values():
+        for x, y in combinations(rows, 2):
+            pairs.setdefault((int(seen[x]), int(seen[y])), []).append((x, y))
+    for pair, both in pairs.items():
+        xs, ys = np.array(both).T
+        yield pair, xs, ys
 
 
 def _join(
-    proposals: list[Proposal],
-    least: float,
-    part: float,
-    join: Callable[[int, int, np.ndarray], None],
+    groups: np.ndarray, Ts: np.ndarray, proposals: list[tuple[float, int, int, np.ndarray]]
 ) -> bool:
-    """Make the links that enough frames agree with, surest first; true if any link is new."""
-    joined_to: dict[int, int] = {}
-    T_root: dict[int, np.ndarray] = {}
+    """Make the links in place, surest first, where no earlier one has; true if any is new.
 
-    def root(x: int) -> tuple[int, np.ndarray]:
-        T = np.eye(4)
-        while x in joined_to:
-            T = T_root[x] @ T
-            x = joined_to[x]
-        return x, T
+    Args:
+        groups: of every camera or marker, and their poses in it, `Ts`.
+        proposals: votes, the groups a and b as they were, and T_a_b.
+    """
+    member = {int(group): index for index, group in enumerate(groups)}
+    Ts_before = Ts.copy()
+
+    def group_now(before: int) -> tuple[int, np.ndarray]:
+        """The group that a group has become a part of, and its pose in that."""
+        one = member[before]
+        return int(groups[one]), Ts[one] @ inverted(Ts_before[one])
 
     any_new = False
-    for votes, frames, a, b, T_a_b in sorted(proposals, key=lambda it: -it[0]):
-        voters = min(frames, _VOTERS)
-        if votes < least or (voters > 1 and votes < part * (voters - 1)):
-            continue
-        (root_a, T_a), (root_b, T_b) = root(a), root(b)
-        if root_a == root_b:
-            continue
-        T = T_a @ T_a_b @ inverted(T_b)
-        join(root_a, root_b, T)
-        joined_to[root_b], T_root[root_b] = root_a, T
-        any_new = True
+    for _, a, b, T_a_b in sorted(proposals, key=lambda proposal: -proposal[0]):
+        (group_a, T_a), (group_b, T_b) = group_now(a), group_now(b)
+        if group_a != group_b:
+            inside = groups == group_b
+            Ts[inside] = T_a @ T_a_b @ inverted(T_b) @ Ts[inside]
+            groups[inside] = group_a
+            any_new = True
     return any_new
 
 

@@ -6,14 +6,14 @@ as possible agree. The size of a marker follows from the rays to its corners alo
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration
-from jaxnav.calibrate.rig.pose_arrays import inverted, turn_rad
-from jaxnav.calibrate.rig.views import RigViews, rays_camera
+from jaxnav.calibrate.rig.views import RigViews, inverted, rays_camera, turn_rad
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.files.poses import transform
@@ -28,24 +28,17 @@ _STEPS = 30
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of the check for one marker of the map.
+    """The result of the check for one marker of the map."""
 
-    Attributes:
-        seen: number of its sightings.
-        apart_m, apart_rad: deviation of the marker found from the map; None if it isn't linked.
-        wrong: true if the deviation is more than tolerance and sigma explain.
-        size_m: side from the distances of its corners; None if too few rays determine it.
-        wrong_size: true if the map has another size.
-        moved_m: distance that it moved during the recording, 0 if it stood still.
-    """
-
-    seen: int
+    seen: int  # number of its sightings
+    # deviation of the marker found from the map; None if it isn't linked
     apart_m: float | None
     apart_rad: float | None
-    wrong: bool
+    wrong: bool  # true if the deviation is more than tolerance and sigma explain
+    # side from the distances of its corners; None if too few rays determine it
     size_m: float | None
-    wrong_size: bool
-    moved_m: float
+    wrong_size: bool  # true if the map has another size
+    moved_m: float  # distance that it moved during the recording, 0 if it stood still
 
     @property
     def right(self) -> bool:
@@ -55,17 +48,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Check:
-    """The result of the check of a map.
+    """The result of the check of a map."""
 
-    Attributes:
-        verdicts: marker index -> verdict.
-        T_map_world: (4, 4) that aligns the markers found with the map.
-        agreeing: number of markers that agree under it.
-    """
-
-    verdicts: dict[int, Verdict]
-    T_map_world: Float[np.ndarray, "4 4"]
-    agreeing: int
+    verdicts: dict[int, Verdict]  # marker index -> verdict
+    T_map_world: Float[np.ndarray, "4 4"]  # that aligns the markers found with the map
+    agreeing: int  # number of markers that agree under it
 
 
 def checked(
@@ -92,31 +79,25 @@ def checked(
         tolerance_m,
         tolerance_rad,
     )
-    rays = _Rays.of(calibration, views, rig)
+    rays = _Rays.from_calibration(calibration, views, rig)
     sigmas = calibration.sigmas()
     verdicts = {}
     for index in given:
-        seen = int(np.sum(views.marker == index))
-        apart_m = apart_rad = None
-        wrong = False
+        apart, wrong = None, False
         if calibration.mapped[index]:
             T = T_map_world @ calibration.Ts_world_marker[index]
-            apart_m = float(np.linalg.norm((T - given[index])[:3, 3]))
-            apart_rad = float(turn_rad(T, given[index]))
-            sigma_m = float(np.linalg.norm(sigmas[C + index, :3]))
-            sigma_rad = float(np.linalg.norm(sigmas[C + index, 3:]))
-            wrong = apart_m > max(tolerance_m, _SIGMAS * sigma_m) or apart_rad > max(
-                tolerance_rad, _SIGMAS * sigma_rad
-            )
+            apart = np.linalg.norm((T - given[index])[:3, 3]), turn_rad(T, given[index])
+            sigma = np.linalg.norm(sigmas[C + index].reshape(2, 3), axis=1)
+            wrong = bool(np.any(apart > np.maximum([tolerance_m, tolerance_rad], _SIGMAS * sigma)))
         size_m, moved_m = rays.size_and_move(index)
-        said_m = float(views.size_m[index])
+        given_m = float(views.size_m[index])
         verdicts[index] = Verdict(
-            seen=seen,
-            apart_m=apart_m,
-            apart_rad=apart_rad,
+            seen=int(np.sum(views.marker == index)),
+            apart_m=None if apart is None else float(apart[0]),
+            apart_rad=None if apart is None else float(apart[1]),
             wrong=wrong,
             size_m=size_m,
-            wrong_size=size_m is not None and abs(size_m / said_m - 1) > _WRONG_SIZE,
+            wrong_size=size_m is not None and abs(size_m / given_m - 1) > _WRONG_SIZE,
             moved_m=moved_m,
         )
     return Check(verdicts, T_map_world, agree)
@@ -124,7 +105,7 @@ def checked(
 
 def sizes_m(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> dict[int, float]:
     """Marker index -> side in m from the rays to its corners, for markers with enough rays."""
-    rays = _Rays.of(calibration, views, rig)
+    rays = _Rays.from_calibration(calibration, views, rig)
     sizes = {index: rays.size_and_move(index)[0] for index in range(len(views.size_m))}
     return {index: size for index, size in sizes.items() if size is not None}
 
@@ -177,8 +158,7 @@ def _laid_over(
     return best, int(most.sum())
 
 
-@dataclass(frozen=True)
-class _Rays:
+class _Rays(NamedTuple):
     """The rays to every corner, in the world of a calibration."""
 
     marker: np.ndarray
@@ -186,18 +166,15 @@ class _Rays:
     directions: np.ndarray  # (N, 4, 3)
 
     @staticmethod
-    def of(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> "_Rays":
+    def from_calibration(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> "_Rays":
         """The rays of the sightings by calibrated cameras in frames with a pose."""
         frame_of = {int(stamp): index for index, stamp in enumerate(calibration.views.stamps_ns)}
         frames = np.array([frame_of.get(int(stamp), -1) for stamp in views.stamps_ns], int)
-        posed = (frames[views.frame] >= 0) & calibration.calibrated[views.camera]
-        rays = rays_camera(rig, views)[posed]
-        Ts = (
-            calibration.Ts_world_vehicle[frames[views.frame[posed]]]
-            @ calibration.Ts_vehicle_camera[views.camera[posed]]
-        )
-        directions = np.einsum("nij,nkj->nki", Ts[:, :3, :3], rays)
-        return _Rays(views.marker[posed], Ts[:, :3, 3], directions)
+        frame = frames[views.frame]
+        posed = (frame >= 0) & calibration.calibrated[views.camera]
+        Ts = calibration.Ts_world_vehicle[frame] @ calibration.Ts_vehicle_camera[views.camera]
+        directions = np.einsum("nij,nkj->nki", Ts[:, :3, :3], rays_camera(rig, views))
+        return _Rays(views.marker[posed], Ts[posed, :3, 3], directions[posed])
 
     def size_and_move(self, index: int) -> tuple[float | None, float]:
         """Side of a marker and the distance that it moved, m; None and 0 if undetermined."""

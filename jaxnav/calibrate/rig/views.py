@@ -1,4 +1,5 @@
-"""Sightings of markers by the cameras of a rig, with their rays and both of their poses."""
+"""Sightings of markers by the cameras of a rig, their rays and both of their poses; and poses in
+arrays: as wxyz_xyz and as matrices."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,36 +9,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.refine import solve_markers
+from jaxnav.files.poses import transform
 
 _BATCH = 1024  # sightings at a time
 
 
 @dataclass(frozen=True)
 class RigViews:
-    """N sightings of M markers by C cameras in F frames: one row each, ordered by frame.
+    """N sightings of M markers by C cameras in F frames: one row each, ordered by frame."""
 
-    Attributes:
-        frame: (N,) index of the frame.
-        camera: (N,) index of the camera in the rig.
-        marker: (N,) index of the marker, into `marker_ids`.
-        corners_px: (N, 4, 2), TL TR BR BL.
-        size_m: (M,) side of each marker.
-        marker_ids: (M,) the id printed on each marker.
-        stamps_ns: (F,) of the frames.
-    """
-
-    frame: Int[np.ndarray, " N"]
-    camera: Int[np.ndarray, " N"]
-    marker: Int[np.ndarray, " N"]
-    corners_px: Float[np.ndarray, "N 4 2"]
-    size_m: Float[np.ndarray, " M"]
-    marker_ids: tuple[int, ...]
-    stamps_ns: Int[np.ndarray, " F"]
+    frame: Int[np.ndarray, " N"]  # index of the frame
+    camera: Int[np.ndarray, " N"]  # index of the camera in the rig
+    marker: Int[np.ndarray, " N"]  # index of the marker, into `marker_ids`
+    corners_px: Float[np.ndarray, "N 4 2"]  # TL TR BR BL
+    size_m: Float[np.ndarray, " M"]  # side of each marker
+    marker_ids: tuple[int, ...]  # (M,) the id printed on each marker
+    stamps_ns: Int[np.ndarray, " F"]  # of the frames
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -123,3 +116,34 @@ def _looking_along(forward: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 
     x = np.cross(aside, forward)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     return np.stack([x, np.cross(forward, x), forward], axis=2)
+
+
+def wxyz_xyz(Ts: Float[np.ndarray, "n 4 4"]) -> Float[Array, "n 7"]:
+    """Convert matrices (n, 4, 4) to wxyz_xyz (n, 7)."""
+    xyzw = Rotation.from_matrix(Ts[:, :3, :3]).as_quat()
+    return jnp.asarray(np.concatenate([xyzw[:, [3, 0, 1, 2]], Ts[:, :3, 3]], axis=1), float)
+
+
+def matrices(poses: Float[Array | np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 4"]:
+    """Convert wxyz_xyz (n, 7) to matrices (n, 4, 4)."""
+    array = np.asarray(poses, float)
+    return transform(Rotation.from_quat(array[:, [1, 2, 3, 0]]).as_matrix(), array[:, 4:])
+
+
+def inverted(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4 4"]:
+    """Inverses of rigid transforms (..., 4, 4)."""
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(R, -(R @ T[..., :3, 3:])[..., 0])
+
+
+def turn_rad(
+    T: Float[np.ndarray, "4 4"], Ts: Float[np.ndarray, "*batch 4 4"]
+) -> Float[np.ndarray, "*batch"]:
+    """Angles between the rotation of T (4, 4) and those of Ts (..., 4, 4)."""
+    trace = np.sum(T[:3, :3] * Ts[..., :3, :3], axis=(-1, -2))
+    return np.asarray(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def Ts_vehicle_camera(rig: CameraRig) -> Float[np.ndarray, "C 4 4"]:
+    """The poses of a rig's cameras, (C, 4, 4)."""
+    return inverted(np.asarray(rig.Ts_camera_vehicle.as_matrix(), float))

@@ -7,8 +7,7 @@ from matplotlib.figure import Figure
 
 from jaxnav import __version__
 from jaxnav.calibrate.board.board import Board
-from jaxnav.calibrate.board.pages import PAPERS_MM, check_fit, largest
-from jaxnav.calibrate.board.sheets import sheet_of
+from jaxnav.calibrate.board.sheets import PAPERS_MM, check_fit, largest, sheet_of
 from jaxnav.commands.calibrate.arguments import CalibrateBoard
 from jaxnav.commands.process import configure_jax
 from jaxnav.core.models.markers import FAMILY_SIZES

@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxnav.calibrate.board.images import CollectedViews
 from jaxnav.calibrate.lens.checks import cells, reach, rim_sigma_px, tilts_deg
-from jaxnav.calibrate.lens.images import calibrate_images
-from jaxnav.calibrate.lens.intrinsics import LensCalibration
+from jaxnav.calibrate.lens.intrinsics import LensCalibration, calibrate_images
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board

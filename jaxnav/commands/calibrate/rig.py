@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration, calibrate_rig
-from jaxnav.calibrate.rig.driven_frame import driven_frame
 from jaxnav.calibrate.rig.marker_check import sizes_m
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
-from jaxnav.calibrate.rig.vehicle_frame import moved_to_driven, moved_to_places
+from jaxnav.calibrate.rig.vehicle_frame import driven_frame, moved_to_driven, moved_to_places
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments import CalibrateMarkers, CalibrateRig
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
 from jaxnav.commands.calibrate.report import (

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera, inverted, turn_rad
 from jaxnav.commands.calibrate.data import RigData
 from jaxnav.commands.calibrate.report import provenance
 from jaxnav.core.models.camera import LENS_COEFFICIENTS

@@ -20,8 +20,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad
-from jaxnav.calibrate.rig.views import both_poses
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera, both_poses, inverted, turn_rad
 from jaxnav.commands.doctor.findings import Finding, found, listed
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap

@@ -8,7 +8,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, found, listed
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.rig import CameraRig

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.doctor.findings import Finding, found, listed
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import MarkerMap

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxnav.calibrate.board.board import Board
-from jaxnav.calibrate.board.detection import find_board, look_at
+from jaxnav.calibrate.board.detection import look_at
 from jaxnav.calibrate.board.images import collect_views, source_files
 from jaxnav.calibrate.board.places import bent_places, straight_places
 from jaxnav.calibrate.board.saddles import Places, fit_saddles
@@ -63,7 +63,7 @@ def truth_px(
 def test_points_are_found_to_hundredths_of_a_pixel(kind: str, pose: int) -> None:
     board = BOARDS[kind]
     expected_px = truth_px(board, POSES[pose])
-    view = find_board(board, picture(kind, pose), "here")
+    view = look_at(board, picture(kind, pose), "here").view
     assert view is not None
     assert view.name == "here"
     inside = np.all((expected_px > 3) & (expected_px < np.array(SIZE_PX) - 4), axis=1)
@@ -76,9 +76,10 @@ def test_points_are_found_to_hundredths_of_a_pixel(kind: str, pose: int) -> None
     assert view.edge_width_px == pytest.approx(2.563 * np.sqrt(0.7**2 + 1 / 12), rel=0.12)
 
 
-@pytest.mark.parametrize("pose", range(len(POSES)))
-@pytest.mark.parametrize("size", [(8, 8), (9, 7), (7, 7)])
-@pytest.mark.parametrize("inverted", [False, True])
+@pytest.mark.parametrize(
+    ("size", "inverted", "pose"),
+    [((8, 8), False, 0), ((9, 7), True, 1), ((7, 7), False, 2), ((7, 7), True, 0)],
+)
 def test_a_chessboard_that_looks_the_same_when_turned_is_found(
     size: tuple[int, int], inverted: bool, pose: int
 ) -> None:
@@ -88,7 +89,7 @@ def test_a_chessboard_that_looks_the_same_when_turned_is_found(
     image = BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor).render(
         POSES[pose], np.random.default_rng(pose)
     )
-    view = find_board(board, image, "here")
+    view = look_at(board, image, "here").view
     assert view is not None
     assert len(view.ids) >= 0.95 * len(board.points_board_m)
     expected_px = truth_px(board, POSES[pose])
@@ -103,7 +104,7 @@ def test_a_chessboard_that_looks_the_same_when_turned_is_found(
 
 def test_a_chessboard_that_one_finder_loses_is_found_by_another(monkeypatch) -> None:
     board, image = BOARDS["chessboard"], picture("chessboard", 0)
-    expected, newer = find_board(board, image, "here"), cv2.findChessboardCornersSB
+    expected, newer = look_at(board, image, "here").view, cv2.findChessboardCornersSB
     assert expected is not None
     widths: list[int] = []
     found_at = 800
@@ -114,19 +115,19 @@ def test_a_chessboard_that_one_finder_loses_is_found_by_another(monkeypatch) -> 
 
     monkeypatch.setattr(cv2, "findChessboardCornersSB", at_one_size_only)
     for found_at, last in ((800, 800), (0, 400)):  # noqa: B007
-        view = find_board(board, image, "here")
+        view = look_at(board, image, "here").view
         assert view is not None
         assert widths[-1] == last
         np.testing.assert_allclose(view.corners_px, expected.corners_px, atol=2e-3)
 
 
 @pytest.mark.parametrize("columns", [8, 9])
-@pytest.mark.parametrize("told", [False, True])
 @pytest.mark.parametrize("printed", [False, True])
 def test_the_pattern_of_a_charuco_board_is_found_out(
-    printed: bool, told: bool, columns: int, tmp_path: Path
+    printed: bool, columns: int, tmp_path: Path
 ) -> None:
-    board = replace(BOARDS["charuco"], columns=columns, white_top_left=told)
+    """Whatever its file says."""
+    board = replace(BOARDS["charuco"], columns=columns, white_top_left=not printed)
     sheet = sheet_of(replace(board, white_top_left=printed))
     sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0)
     image = BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor).render(
@@ -140,7 +141,7 @@ def test_the_pattern_of_a_charuco_board_is_found_out(
     error_px = look.view.corners_px - truth_px(board, POSES[0])[look.view.ids]
     assert np.sqrt(np.mean(error_px**2)) < 0.015
     cv2.imwrite(str(tmp_path / "0.png"), image)
-    assert collect_views(board, [tmp_path]).other_pattern == (printed != told)
+    assert collect_views(board, [tmp_path]).other_pattern
 
 
 def test_a_spurious_id_does_not_refuse_a_set(tmp_path: Path) -> None:
@@ -161,7 +162,7 @@ def test_a_spurious_id_does_not_refuse_a_set(tmp_path: Path) -> None:
 def test_a_marker_s_corners_are_found_through_its_lens() -> None:
     board = BOARDS["marker"]
     for pose in (0, 1):
-        view = find_board(board, picture("marker", pose), "here", CAMERA)
+        view = look_at(board, picture("marker", pose), "here", CAMERA).view
         assert view is not None
         error_px = view.corners_px - truth_px(board, POSES[pose])
         assert np.sqrt(np.mean(error_px**2)) < 0.02
@@ -173,7 +174,7 @@ def test_we_are_nearer_to_the_truth_than_opencv(kind: str) -> None:
     board, errors, theirs = BOARDS[kind], [], []
     for pose in range(len(POSES)):
         image, expected_px = picture(kind, pose), truth_px(board, POSES[pose])
-        view = find_board(board, image, "here")
+        view = look_at(board, image, "here").view
         assert view is not None
         end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
         start = expected_px[view.ids, None].astype(np.float32)
@@ -186,7 +187,7 @@ def test_we_are_nearer_to_the_truth_than_opencv(kind: str) -> None:
 def test_blur_widens_the_edges() -> None:
     board = BOARDS["charuco"]
     sharp, blurred = (
-        find_board(board, picture("charuco", 0, blur_px), "here") for blur_px in (0.7, 1.4)
+        look_at(board, picture("charuco", 0, blur_px), "here").view for blur_px in (0.7, 1.4)
     )
     assert sharp is not None
     assert blurred is not None
@@ -208,27 +209,27 @@ def test_motion_widens_the_edges_across_it() -> None:
         return poses
 
     image = moving.render_moving(T_board_camera_at, np.random.default_rng(0))
-    view = find_board(board, image, "here")
+    view = look_at(board, image, "here").view
     assert view is not None
     T_camera_board = facing_pose((0, 0, 0.2), (0, 0))
     error_px = view.corners_px - truth_px(board, T_camera_board)[view.ids]
     assert np.sqrt(np.mean(error_px**2)) < 0.04
-    still = find_board(
+    still = look_at(
         board, renderer("charuco").render(T_camera_board, np.random.default_rng(0)), ""
-    )
+    ).view
     assert still is not None
     assert view.edge_width_px > 1.2 * still.edge_width_px
 
 
 def test_a_point_that_is_moved_in_the_image_is_dropped() -> None:
     board, image = BOARDS["chessboard"], picture("chessboard", 0).copy()
-    before = find_board(board, image, "here")
+    before = look_at(board, image, "here").view
     assert before is not None
     victim = 24
     u, v = np.rint(before.corners_px[victim]).astype(int)
     # What was 3 px to the left comes here: a saddle as good as any other, in a wrong place.
     image[v - 9 : v + 10, u - 9 : u + 10] = image[v - 9 : v + 10, u - 12 : u + 7].copy()
-    after = find_board(board, image, "here")
+    after = look_at(board, image, "here").view
     assert after is not None
     assert before.ids[victim] not in after.ids
     assert len(after.ids) >= len(before.ids) - 3

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from jaxnav.calibrate.board.board import Board
-from jaxnav.calibrate.board.detection import find_board
+from jaxnav.calibrate.board.detection import look_at
 from jaxnav.calibrate.board.images import collect_views
-from jaxnav.calibrate.lens.images import calibrate_images
+from jaxnav.calibrate.lens.intrinsics import calibrate_images
 from jaxnav.errors import BadInput
 from jaxnav.sim.boards import BoardRenderer, facing_pose
 from jaxnav.sim.sensor import Sensor
@@ -59,8 +59,8 @@ def off_px(board: Board, found_px: np.ndarray, T_camera_board: np.ndarray) -> np
 def test_centres_are_found_through_a_lens(kind: str, pose: int) -> None:
     board = BOARDS[kind]
     image = renderer(kind).render(POSES[pose], np.random.default_rng(pose))
-    view = find_board(board, image, "here", CAMERA)
-    centroids = find_board(board, image, "here")
+    view = look_at(board, image, "here", CAMERA).view
+    centroids = look_at(board, image, "here").view
     assert view is not None
     assert centroids is not None
     assert len(view.ids) == len(board.points_board_m)
@@ -68,7 +68,7 @@ def test_centres_are_found_through_a_lens(kind: str, pose: int) -> None:
     assert np.sqrt(np.mean(error_px**2)) < 0.015
     # A disc's centroid is not its centre.
     assert np.sqrt(np.mean(off_px(board, centroids.corners_px, POSES[pose]) ** 2)) > 0.08
-    light = find_board(board, 255 - image, "here", CAMERA)
+    light = look_at(board, 255 - image, "here", CAMERA).view
     assert light is not None
     assert np.sqrt(np.mean(off_px(board, light.corners_px, POSES[pose]) ** 2)) < 0.015
 

@@ -13,9 +13,16 @@ from scipy import stats
 from jaxnav.calibrate.rig import bundle
 from jaxnav.calibrate.rig.calibrate import RigCalibration, calibrate_rig
 from jaxnav.calibrate.rig.marker_check import checked, sizes_m
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted, turn_rad, wxyz_xyz
 from jaxnav.calibrate.rig.vehicle_frame import moved_to_places
-from jaxnav.calibrate.rig.views import RigViews, both_poses, rays_camera
+from jaxnav.calibrate.rig.views import (
+    RigViews,
+    Ts_vehicle_camera,
+    both_poses,
+    inverted,
+    rays_camera,
+    turn_rad,
+    wxyz_xyz,
+)
 from jaxnav.core.linalg.schur import Blocks, reduce
 from jaxnav.errors import BadInput
 

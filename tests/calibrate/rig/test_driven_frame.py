@@ -8,9 +8,8 @@ import pytest
 import rig_rooms
 
 from jaxnav.calibrate.rig.calibrate import calibrate_rig
-from jaxnav.calibrate.rig.driven_frame import _level, driven_frame, level_follows
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, inverted
-from jaxnav.calibrate.rig.vehicle_frame import moved_to_driven
+from jaxnav.calibrate.rig.vehicle_frame import _level, driven_frame, level_follows, moved_to_driven
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera, inverted
 from jaxnav.core.models.vehicle import advance_bicycle
 from jaxnav.errors import BadInput
 

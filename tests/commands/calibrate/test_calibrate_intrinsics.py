@@ -11,8 +11,8 @@ import pytest
 
 from jaxnav import cli
 from jaxnav.calibrate.board.board import Board
-from jaxnav.calibrate.lens import comparison as lens_comparison
-from jaxnav.calibrate.lens.images import calibrate_images
+from jaxnav.calibrate.lens import choice
+from jaxnav.calibrate.lens.intrinsics import calibrate_images
 from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import write_board
@@ -134,7 +134,7 @@ def test_videos_and_folders_of_several_cameras_go_together(shots, tmp_path, caps
 
 
 def test_a_marker_is_looked_at_again_with_the_lens_it_told(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(lens_comparison, "FEWEST_VIEWS", 100)  # which compiles long
+    monkeypatch.setattr(choice, "FEWEST_VIEWS", 100)  # which compiles long
     rendered(tmp_path / "shots", MARKER, 12, seed=5, distances_m=(0.15, 0.4), fewest=4)
     _, found = calibrate_images(MARKER, [tmp_path / "shots"], "equidistant")
     np.testing.assert_allclose(found.fit.parameters[:2], 319, rtol=1e-3)

@@ -120,7 +120,7 @@ def test_what_is_fixed_stays(capsys, tmp_path, recording):
     report = json.loads((out / "report.json").read_text())
     wheelbase = report["parameters"]["wheelbase_m"]
     assert (wheelbase["value"], wheelbase["sigma"]) == (0.256, None)
-    assert wheelbase["kept"] == "as told by --fix"
+    assert wheelbase["kept"] == "as given by --fix"
     assert "kept" in capsys.readouterr().out
 
 

@@ -10,7 +10,7 @@ import rig_rooms
 import yaml
 
 from jaxnav import cli
-from jaxnav.calibrate.rig.pose_arrays import Ts_vehicle_camera, turn_rad
+from jaxnav.calibrate.rig.views import Ts_vehicle_camera, turn_rad
 from jaxnav.commands.calibrate import check as calibrate_check
 from jaxnav.commands.calibrate import rig as calibrate_rig
 from jaxnav.commands.calibrate.rig_results import coverage
