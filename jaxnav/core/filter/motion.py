@@ -87,7 +87,8 @@ def follow_pose(
     end = n - behind
     away = inverse_cayley(T_world_prior.inverse() @ posterior.T_world_vehicle)
     xi = matvec(freedom.T, away)
-    C = sandwich(freedom.T, posterior.covariance) / posterior.inflation
+    inflation = 1.0 if posterior.inflation is None else posterior.inflation
+    C = sandwich(freedom.T, posterior.covariance) / inflation
     # Error at the corrected pose -> at the prediction.
     M = sandwich(freedom.T, inverse_cayley_jacobian(away))
     y, P_yy, P_y, given_pose = xi, P[:d, :d], P[:d], None
@@ -112,7 +113,7 @@ def follow_pose(
     # thousands of times as wide.
     by_pose = sandwich(jnp.concatenate([jnp.eye(d, dtype=C.dtype), product(gain, M)]), C)
     after = kalman.symmetrise(by_pose.at[d:, d:].add(rest))
-    wider = (posterior.inflation - 1) * by_pose[:states, :states]
+    wider = (inflation - 1) * by_pose[:states, :states]
     after = after.at[:states, :states].add(wider)
     return jnp.append(xi, matvec(gain, y)), kalman.add_floor(after, P)
 
@@ -139,7 +140,8 @@ class Motion(eqx.Module):
     """Base class of the motion models: the abstract methods differ, the others are shared."""
 
     states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
-    gate_nis: eqx.AbstractVar[float]  # a larger NIS contradicts a hypothesis; inf: no gate
+    # A pose of a larger NIS contradicts a hypothesis; inf: no gate. Each model has its own.
+    gate_nis: float = eqx.field(default=float("inf"), kw_only=True)
     camera_states: int = eqx.field(static=True, default=0, kw_only=True)  # see `for_rig`
     # Sigma of the orientation below which the errors of sensors and cameras are estimated.
     learn_sigma_rad: float = eqx.field(default=0.035, kw_only=True)
@@ -174,8 +176,24 @@ class Motion(eqx.Module):
         """Poses, covariances and weights of the hypotheses, for a selector."""
 
     @abc.abstractmethod
+    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """One hypothesis and a candidate that its selector has chosen (Eqs. 10 and 11)."""
+
+    @abc.abstractmethod
+    def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
+        """One hypothesis that takes over the pose that its selector has corrected."""
+
     def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """One hypothesis as the pose that its selector has chosen, or corrected, makes of it."""
+        """What a pose makes of one hypothesis, for the gate."""
+        if measured.innovation is None:
+            return self.fused(bank, measured)
+        return Offer(
+            measured.innovation,
+            self.adopted(bank, measured),
+            self.gate_nis,
+            measured.log_likelihood,
+            1.0 if measured.inflation is None else measured.inflation,
+        )
 
     @abc.abstractmethod
     def start(self, bank: Bank, measured: MeasuredPose, obs: Observation) -> Moments:

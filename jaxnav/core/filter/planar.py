@@ -104,7 +104,7 @@ class BicycleKalman(Motion):
     )  # before the first odometry, m/s m/s rad/s
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
-    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 %; inf: no gate
+    gate_nis: float = eqx.field(default=21.1, kw_only=True)  # chi-square, 3 dof, at 99.99 %
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
@@ -183,10 +183,8 @@ class BicycleKalman(Motion):
             errors,
         )
 
-    def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """One hypothesis as a pose makes of it, in 3 dof; see `Motion`."""
-        if measured.innovation is not None:
-            return self._adopted(bank, measured)
+    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """See `Motion`, in 3 dof."""
         P = bank.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
@@ -207,8 +205,8 @@ class BicycleKalman(Motion):
             posterior=(self.moved(bank.mean, correction), posterior),
         )
 
-    def _adopted(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """The same, of a pose that the selector has corrected by the corners."""
+    def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
+        """See `Motion`, in 3 dof."""
         T, velocity_lead = measured.T_world_vehicle, bank.velocity_lead
         pose = planar_from_T_world_vehicle(T)
         seen, slope = seen_pose(bank.mean, velocity_lead)
@@ -224,14 +222,7 @@ class BicycleKalman(Motion):
             0 if self.vehicle.gyro is None else GYRO,
         )
         P = kalman.replace_first(P, planar_rotation(pose[2]))
-        posterior = _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, velocity_lead)
-        return Offer(
-            measured.innovation,
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood,
-            inflation=measured.inflation,
-            posterior=posterior,
-        )
+        return _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, velocity_lead)
 
     def for_rig(self, rig: CameraRig, hypotheses: int) -> "BicycleKalman":
         """The model with the errors of cameras and sensors; the paper's six states for one rule."""
