@@ -57,7 +57,7 @@ def follow_pose(
     states: int,
     behind: int = 0,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The whole state after its pose was corrected: the rest follows by regression.
+    """Correct the rest of a state after its pose, by regression.
 
     With y = (xi, q), the pose's error and the errors of the cameras in view, the rest v, and the
     gain G = P_vy P_yy^-1:
@@ -164,7 +164,7 @@ class Motion(eqx.Module):
         """
 
     def sound(self, bank: Bank) -> Bank:
-        """The bank whose hypotheses that are not finite begin anew."""
+        """Start hypotheses anew that are not finite."""
         return restart_broken(bank, self.init(bank.initialised.shape[0]))
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
@@ -177,14 +177,14 @@ class Motion(eqx.Module):
 
     @abc.abstractmethod
     def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """One hypothesis and a candidate that its selector has chosen (Eqs. 10 and 11)."""
+        """Fuse one hypothesis with a candidate that its selector has chosen (Eqs. 10 and 11)."""
 
     @abc.abstractmethod
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
-        """One hypothesis that takes over the pose that its selector has corrected."""
+        """Take over a pose that the selector has corrected, and correct the rest."""
 
     def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """What a pose makes of one hypothesis, for the gate."""
+        """Correct one hypothesis by a pose, for the gate to take or leave."""
         if measured.innovation is None:
             return self.fused(bank, measured)
         return Offer(
@@ -197,7 +197,7 @@ class Motion(eqx.Module):
 
     @abc.abstractmethod
     def start(self, bank: Bank, measured: MeasuredPose, obs: Observation) -> Moments:
-        """One hypothesis that begins at a measured pose."""
+        """Start one hypothesis at a measured pose."""
 
     @abc.abstractmethod
     def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
@@ -223,7 +223,7 @@ class Motion(eqx.Module):
         """Whether the errors that are only considered at first are estimated by now."""
 
     def schmidt_update(self, learns: Bool[Array, ""], before: Moments, after: Moments) -> Moments:
-        """The posterior whose errors keep their mean and covariance unless the model `learns`.
+        """Keep mean and covariance of the errors through an update, unless the model `learns`.
 
         Pose and velocity are corrected by their own gain, and stay correlated with the errors.
 
@@ -249,7 +249,7 @@ class Motion(eqx.Module):
         """
 
     def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
-        """The posterior of every hypothesis (Eqs. 10 and 11), with those merged that are one.
+        """Update every hypothesis (Eqs. 10 and 11), and merge those that have become one.
 
         A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
         NIS is inside the gate, and counted as a rejection where it is not.

@@ -348,7 +348,7 @@ class BicycleKalman(Motion):
         since_s: Array | float = 0.0,
         turns: Array | None = None,
     ) -> Moments:
-        """The state after the odometry has measured its velocity, at its own heading.
+        """Update a state by the velocity that the odometry reads at its heading, and by its step.
 
         What the sensors read says nothing of their own errors, which are only considered.
 
@@ -361,7 +361,7 @@ class BicycleKalman(Motion):
     def _stepped(
         self, mean: Array, P: Array, obs: Observation, since_s: Array | float, turns: Array | None
     ) -> Array:
-        """The covariance of a velocity that has changed by a step to what is read."""
+        """Widen the covariance by a step of the velocity to what is read."""
         read = read_velocity(self.vehicle, obs, mean)
         step = _present(read, turns) * (read.velocity - mean[3:SIX])
         dt_s = jnp.asarray(since_s, mean.dtype)
@@ -369,7 +369,7 @@ class BicycleKalman(Motion):
         return P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
 
     def _read(self, mean: Array, P: Array, obs: Observation, turns: Array | None = None) -> Moments:
-        """The state whose velocity the odometry has measured."""
+        """Update a state by the velocity that the odometry reads."""
         dtype = mean.dtype
         read = read_velocity(self.vehicle, obs, mean)
         H = jnp.eye(3, SIX, k=3, dtype=dtype).at[:, 2].set(-read.by_heading)
