@@ -272,7 +272,6 @@ def _fused(
             jnp.where(finite, log_likelihood, 0),
             finite,
             innovation=jnp.where(finite, contradiction, jnp.inf),
-            inflation=jnp.ones((), dtype),
             errors=jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0), errors_in_view),
         ),
         cost=jnp.where(finite, jnp.where(linear, misfit, cost), jnp.inf),

@@ -106,10 +106,8 @@ class FreeBody(Motion):
         behind = P.shape[-1] - self.camera_states
         return CameraErrors(bank.mean[:, behind + 1 :], P[:, behind:, behind:], P[:, :6, behind:])
 
-    def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """One hypothesis as a pose makes of it, in 6 dof; see `Motion`."""
-        if measured.innovation is not None:
-            return self._adopted(bank, measured)
+    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """See `Motion`, in 6 dof."""
         mean, P = bank.mean, bank.covariance
         log_volume = log_det(cholesky(measured.covariance)) / 2
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
@@ -124,8 +122,8 @@ class FreeBody(Motion):
             posterior=(self.moved(mean, correction), posterior),
         )
 
-    def _adopted(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """The same, of a pose that the selector has corrected by the corners."""
+    def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
+        """See `Motion`, in 6 dof."""
         T = measured.T_world_vehicle
         correction, P = follow_pose(
             bank.covariance,
@@ -138,13 +136,7 @@ class FreeBody(Motion):
             sigma_rad = jnp.asarray(self.camera_turn_sigma_rad, P.dtype)
             common = common_turn(measured.errors, sigma_rad)
             correction, P = schmidt_update_along(common, bank.covariance, correction, P)
-        return Offer(
-            measured.innovation,
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood,
-            inflation=measured.inflation,
-            posterior=(jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P),
-        )
+        return jnp.append(T.wxyz_xyz, bank.mean[7:] + correction[6:]), P
 
     def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
         """(xi, difference of the twists), (12,): mean = base * cay(xi), in the axes of `base`."""

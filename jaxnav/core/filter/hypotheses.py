@@ -387,15 +387,15 @@ class MultiHypothesis(eqx.Module):
         )
         second = self.second_poses(bank, heaviest, candidates, snapshot)
         tried = give_slots(second, ~bank.initialised & ~starts)
+        T_prior, P_prior = predicted
         fits = fit_poses(
-            *predicted, of_errors, prior, snapshot, floor, self.max_steps, elsewhere=tried
+            T_prior, P_prior, of_errors, prior, snapshot, floor, self.max_steps, elsewhere=tried
         )
         alive = bank.initialised & fits.finite
         free_cost = candidates.least_cost
-        posteriors, log_evidence, inflation = self._inflated(fits, free_cost, alive, starts)
+        posteriors, nis, log_evidence, inflation = self._inflated(fits, free_cost, alive, starts)
         least_cost = jnp.min(jnp.where(alive, fits.cost, jnp.inf))
         fits_one = starts | (least_cost - free_cost < self.gate)
-        nis = jnp.sum(posteriors.innovation**2, axis=1)
         passes = starts | (nis <= prior.gate_nis * inflation)
         # What one frame subtracts from a log-weight is bounded.
         compared = alive & fits_one
@@ -416,7 +416,7 @@ class MultiHypothesis(eqx.Module):
 
         # A hypothesis whose pose the gate rejects stays where it was predicted.
         corrected = posteriors.T_world_vehicle, posteriors.covariance
-        after = where(passes, corrected, predicted)
+        after = T_after, P_after = where(passes, corrected, (T_prior, P_prior))
         costs, nearest, flip_probability, decided = self._verdict(
             after, log_weight, alive, candidates, fits_one
         )
@@ -426,9 +426,10 @@ class MultiHypothesis(eqx.Module):
             merged_into = jax.lax.cond(
                 jnp.sum(alive) > 1,
                 lambda: find_merges(
-                    *after,
+                    T_after,
+                    P_after,
                     jnp.where(alive, log_weight, -jnp.inf),
-                    self._linear(after[0], snapshot),
+                    self._linear(T_after, snapshot),
                     prior.freedom,
                     self.merge_distance,
                 ),
@@ -452,8 +453,8 @@ class MultiHypothesis(eqx.Module):
         free_cost: Float[Array, ""],
         alive: Bool[Array, " K"],
         starts: Bool[Array, ""],
-    ) -> tuple[MeasuredPose, Float[Array, " K"], Float[Array, ""]]:
-        """The posteriors where all hypotheses misfit, their log-evidence, and the inflation.
+    ) -> tuple[MeasuredPose, Float[Array, " K"], Float[Array, " K"], Float[Array, ""]]:
+        """The posteriors where all hypotheses misfit, NIS and log-evidence, and the inflation.
 
         The inflation, at least 1, by which the covariances of prediction and corners are too small
         is the least NIS of the hypotheses over three sigmas of its chi-square. Where even that one
@@ -464,24 +465,27 @@ class MultiHypothesis(eqx.Module):
         Where residuals are linear it is that, plus what the prediction pays. In the wrong one of
         two minima it is small as long as the prediction is wide, but the image contradicts it.
         """
-        posterior = fits.posterior
-        nis = jnp.sum(posterior.innovation**2, axis=1)
+        posterior, innovation = fits.posterior, fits.posterior.innovation
+        assert innovation is not None
+        nis = jnp.sum(innovation**2, axis=1)
         least = jnp.min(jnp.where(alive, nis, jnp.inf))
         known = jnp.isfinite(least) & ~starts
-        freedom = jnp.asarray(posterior.innovation.shape[1], least.dtype)
+        freedom = jnp.asarray(innovation.shape[1], least.dtype)
         inflation = excess_of(jnp.where(known, least, 0), freedom)
         inflation = jnp.minimum(inflation, self.max_inflation).astype(least.dtype)
         excess = fits.cost - free_cost
         more = (excess > nis) & (nis > 0)
         growth = jnp.sqrt(jnp.where(more, excess / jnp.where(more, nis, 1), 1))
         forgiven = jnp.where(fits.finite, nis, 0) * (1 - 1 / inflation) / 2
+        innovation = innovation * growth[:, None]
         inflated = dataclasses.replace(
             posterior,
             covariance=posterior.covariance * inflation,
-            inflation=posterior.inflation * inflation,
-            innovation=posterior.innovation * growth[:, None],
+            innovation=innovation,
+            inflation=jnp.broadcast_to(inflation, nis.shape),
         )
-        return inflated, fits.log_evidence + forgiven, inflation
+        nis = jnp.sum(innovation**2, axis=1)
+        return inflated, nis, fits.log_evidence + forgiven, inflation
 
     def _verdict(
         self,

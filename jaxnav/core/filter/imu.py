@@ -157,7 +157,7 @@ class InertialMotion(FreeBody):
         return jnp.concatenate([R_after.wxyz, place, velocity, rate, biases, mean[19:]])
 
     def _rested(self, bank: Bank, still: Bool[Array, ""]) -> Bank:
-        """The bank corrected by zero velocity and turn rate where the body is at rest."""
+        """Update a bank by zero velocity and turn rate, where the body is at rest."""
         dtype = bank.mean.dtype
         H = jnp.eye(6, 12, k=6, dtype=dtype)
         R = jnp.diag(jnp.asarray(self.still_sigma, dtype) ** 2)

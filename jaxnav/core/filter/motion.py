@@ -57,7 +57,7 @@ def follow_pose(
     states: int,
     behind: int = 0,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The whole state after its pose was corrected: the rest follows by regression.
+    """Correct the rest of a state after its pose, by regression.
 
     With y = (xi, q), the pose's error and the errors of the cameras in view, the rest v, and the
     gain G = P_vy P_yy^-1:
@@ -87,7 +87,8 @@ def follow_pose(
     end = n - behind
     away = inverse_cayley(T_world_prior.inverse() @ posterior.T_world_vehicle)
     xi = matvec(freedom.T, away)
-    C = sandwich(freedom.T, posterior.covariance) / posterior.inflation
+    inflation = 1.0 if posterior.inflation is None else posterior.inflation
+    C = sandwich(freedom.T, posterior.covariance) / inflation
     # Error at the corrected pose -> at the prediction.
     M = sandwich(freedom.T, inverse_cayley_jacobian(away))
     y, P_yy, P_y, given_pose = xi, P[:d, :d], P[:d], None
@@ -112,7 +113,7 @@ def follow_pose(
     # thousands of times as wide.
     by_pose = sandwich(jnp.concatenate([jnp.eye(d, dtype=C.dtype), product(gain, M)]), C)
     after = kalman.symmetrise(by_pose.at[d:, d:].add(rest))
-    wider = (posterior.inflation - 1) * by_pose[:states, :states]
+    wider = (inflation - 1) * by_pose[:states, :states]
     after = after.at[:states, :states].add(wider)
     return jnp.append(xi, matvec(gain, y)), kalman.add_floor(after, P)
 
@@ -139,7 +140,8 @@ class Motion(eqx.Module):
     """Base class of the motion models: the abstract methods differ, the others are shared."""
 
     states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
-    gate_nis: eqx.AbstractVar[float]  # a larger NIS contradicts a hypothesis; inf: no gate
+    # A pose of a larger NIS contradicts a hypothesis; inf: no gate. Each model has its own.
+    gate_nis: float = eqx.field(default=float("inf"), kw_only=True)
     camera_states: int = eqx.field(static=True, default=0, kw_only=True)  # see `for_rig`
     # Sigma of the orientation below which the errors of sensors and cameras are estimated.
     learn_sigma_rad: float = eqx.field(default=0.035, kw_only=True)
@@ -162,7 +164,7 @@ class Motion(eqx.Module):
         """
 
     def sound(self, bank: Bank) -> Bank:
-        """The bank whose hypotheses that are not finite begin anew."""
+        """Start hypotheses anew that are not finite."""
         return restart_broken(bank, self.init(bank.initialised.shape[0]))
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
@@ -174,12 +176,28 @@ class Motion(eqx.Module):
         """Poses, covariances and weights of the hypotheses, for a selector."""
 
     @abc.abstractmethod
+    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """Fuse one hypothesis with a candidate that its selector has chosen (Eqs. 10 and 11)."""
+
+    @abc.abstractmethod
+    def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
+        """Take over a pose that the selector has corrected, and correct the rest."""
+
     def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """One hypothesis as the pose that its selector has chosen, or corrected, makes of it."""
+        """Correct one hypothesis by a pose, for the gate to take or leave."""
+        if measured.innovation is None:
+            return self.fused(bank, measured)
+        return Offer(
+            measured.innovation,
+            self.adopted(bank, measured),
+            self.gate_nis,
+            measured.log_likelihood,
+            1.0 if measured.inflation is None else measured.inflation,
+        )
 
     @abc.abstractmethod
     def start(self, bank: Bank, measured: MeasuredPose, obs: Observation) -> Moments:
-        """One hypothesis that begins at a measured pose."""
+        """Start one hypothesis at a measured pose."""
 
     @abc.abstractmethod
     def difference(self, mean: Float[Array, " n"], base: Float[Array, " n"]) -> Float[Array, " d"]:
@@ -205,7 +223,7 @@ class Motion(eqx.Module):
         """Whether the errors that are only considered at first are estimated by now."""
 
     def schmidt_update(self, learns: Bool[Array, ""], before: Moments, after: Moments) -> Moments:
-        """The posterior whose errors keep their mean and covariance unless the model `learns`.
+        """Keep mean and covariance of the errors through an update, unless the model `learns`.
 
         Pose and velocity are corrected by their own gain, and stay correlated with the errors.
 
@@ -231,7 +249,7 @@ class Motion(eqx.Module):
         """
 
     def update(self, bank: Bank, selection: Selection, obs: Observation) -> BankUpdate:
-        """The posterior of every hypothesis (Eqs. 10 and 11), with those merged that are one.
+        """Update every hypothesis (Eqs. 10 and 11), and merge those that have become one.
 
         A measured pose starts a hypothesis that is not initialised. Otherwise it is fused where its
         NIS is inside the gate, and counted as a rejection where it is not.

@@ -84,7 +84,7 @@ class ReadVelocity(NamedTuple):
 def read_velocity(
     vehicle: Vehicle | TwistBase, obs: Observation, mean: Float[Array, " n"]
 ) -> ReadVelocity:
-    """The velocity that a vehicle's odometry means to a state.
+    """Convert what a vehicle's odometry reads to a velocity in the world, at a state's heading.
 
     Args:
         mean: (6,), or longer with the errors p behind.
@@ -100,7 +100,7 @@ def read_velocity(
 
 
 def velocity_of_twist(twist: Float[Array, " 6"] | None, mean: Float[Array, " n"]) -> ReadVelocity:
-    """The velocity that a twist in the vehicle's axes means to a state, in the world.
+    """Convert a twist in the vehicle's axes to a velocity in the world, at a state's heading.
 
     Args:
         twist: of it v_x, v_y and omega are used; where one of the first two is NaN, neither is.
@@ -136,7 +136,7 @@ def velocity_of_bicycle(
     mean: Float[Array, " n"],
     wheelbase_m: Float[Array, ""],
 ) -> ReadVelocity:
-    """The velocity (Eqs. 6 and 7) that speed and steering mean to a state, in the world.
+    """Convert speed and steering to a velocity in the world (Eqs. 6, 7), at a state's heading.
 
     Args:
         mean: (6,), or longer with the errors p behind.
@@ -169,7 +169,7 @@ def slipped(
     sigma: Float[Array, ""],
     length_m: Float[Array, ""],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The state after a way, in which a part of the slip was forgotten for another.
+    """Let the slip of the wheels fade over a way, and another one come.
 
         s' = f s + w,    f = exp(-way / length),    var w = (1 - f^2) sigma^2
 
@@ -273,7 +273,7 @@ def turn_of(
     mean: Float[Array, " n"],
     acceleration_density: Float[Array, ""],
 ) -> Turn:
-    """The turn that a gyro tells.
+    """Read the turn of an interval off a gyro.
 
     Args:
         mean: of the state before, the gyro's errors last.
@@ -308,7 +308,7 @@ def turned(
     Q: Float[Array, "6 6"],
     dt_s: Float[Array, ""],
 ) -> tuple[Float[Array, " 6"], Float[Array, "6 n"], Float[Array, "6 6"]]:
-    """Pose and velocity after an interval (Eq. 9), their rows and their noise, with its turn.
+    """Pose and velocity after an interval (Eq. 9) in which a gyro has read the turn.
 
     The velocity turns along. Left in the world it would lag behind the heading in every curve, and
     the wheels, which read it at the heading, would say that the vehicle has turned less.
@@ -356,7 +356,7 @@ def slip_of(
     mean: Float[Array, " n"],
     P: Float[Array, "n n"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The state after the wheels' turn rate was compared with the gyro's.
+    """Compare the wheels' turn rate with the gyro's.
 
     It teaches the errors of the wheels, and nothing else. Where the two differ by more than those
     explain, the wheels slip: the variance of the slip grows by what is left.
@@ -391,7 +391,7 @@ def bias_at_rest(
     mean: Float[Array, " n"],
     P: Float[Array, "n n"],
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The state after a gyro was compared with wheels that stand, if they do.
+    """Compare a gyro with wheels that stand, if they do.
 
     The other errors behind pose and velocity keep their mean and covariance.
 

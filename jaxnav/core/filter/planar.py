@@ -104,7 +104,7 @@ class BicycleKalman(Motion):
     )  # before the first odometry, m/s m/s rad/s
     tilt_sigma_rad: float = 0.005  # roll and pitch of the cameras, against level and calibration
     height_sigma_m: float = 0.002
-    gate_nis: float = 21.1  # chi-square with 3 dof at 99.99 %; inf: no gate
+    gate_nis: float = eqx.field(default=21.1, kw_only=True)  # chi-square, 3 dof, at 99.99 %
 
     def init(self, hypotheses: int = 1) -> Bank:
         """A bank of K hypotheses before the first pose."""
@@ -183,10 +183,8 @@ class BicycleKalman(Motion):
             errors,
         )
 
-    def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """One hypothesis as a pose makes of it, in 3 dof; see `Motion`."""
-        if measured.innovation is not None:
-            return self._adopted(bank, measured)
+    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+        """See `Motion`, in 3 dof."""
         P = bank.covariance
         pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
         R = planar_covariance(measured.T_world_vehicle, measured.covariance)
@@ -207,8 +205,8 @@ class BicycleKalman(Motion):
             posterior=(self.moved(bank.mean, correction), posterior),
         )
 
-    def _adopted(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """The same, of a pose that the selector has corrected by the corners."""
+    def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
+        """See `Motion`, in 3 dof."""
         T, velocity_lead = measured.T_world_vehicle, bank.velocity_lead
         pose = planar_from_T_world_vehicle(T)
         seen, slope = seen_pose(bank.mean, velocity_lead)
@@ -224,14 +222,7 @@ class BicycleKalman(Motion):
             0 if self.vehicle.gyro is None else GYRO,
         )
         P = kalman.replace_first(P, planar_rotation(pose[2]))
-        posterior = _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, velocity_lead)
-        return Offer(
-            measured.innovation,
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood,
-            inflation=measured.inflation,
-            posterior=posterior,
-        )
+        return _at_stamp(jnp.append(pose, bank.mean[3:] + correction[3:]), P, velocity_lead)
 
     def for_rig(self, rig: CameraRig, hypotheses: int) -> "BicycleKalman":
         """The model with the errors of cameras and sensors; the paper's six states for one rule."""
@@ -357,7 +348,7 @@ class BicycleKalman(Motion):
         since_s: Array | float = 0.0,
         turns: Array | None = None,
     ) -> Moments:
-        """The state after the odometry has measured its velocity, at its own heading.
+        """Update a state by the velocity that the odometry reads at its heading, and by its step.
 
         What the sensors read says nothing of their own errors, which are only considered.
 
@@ -370,7 +361,7 @@ class BicycleKalman(Motion):
     def _stepped(
         self, mean: Array, P: Array, obs: Observation, since_s: Array | float, turns: Array | None
     ) -> Array:
-        """The covariance of a velocity that has changed by a step to what is read."""
+        """Widen the covariance by a step of the velocity to what is read."""
         read = read_velocity(self.vehicle, obs, mean)
         step = _present(read, turns) * (read.velocity - mean[3:SIX])
         dt_s = jnp.asarray(since_s, mean.dtype)
@@ -378,7 +369,7 @@ class BicycleKalman(Motion):
         return P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
 
     def _read(self, mean: Array, P: Array, obs: Observation, turns: Array | None = None) -> Moments:
-        """The state whose velocity the odometry has measured."""
+        """Update a state by the velocity that the odometry reads."""
         dtype = mean.dtype
         read = read_velocity(self.vehicle, obs, mean)
         H = jnp.eye(3, SIX, k=3, dtype=dtype).at[:, 2].set(-read.by_heading)

@@ -71,7 +71,7 @@ class Trail(eqx.Module):
         parent: Int[Array, " K"],
         obs: Observation,
     ) -> "Trail":
-        """The trail one observation earlier; another one begins where this one does.
+        """Go back by one observation; another trail begins where this one does.
 
         Args:
             bank: after the earlier observation, and whether it was decided.
@@ -216,7 +216,7 @@ class Window(eqx.Module):
         return Window(links, slots, parent, dt_s, jnp.asarray(0), jnp.asarray(lag_s, P.dtype))
 
     def after(self, motion: Motion, before: Bank, after: Bank, obs: Observation) -> "Window":
-        """The window with the step from one bank to the next.
+        """Append the step from one bank to the next.
 
         Args:
             before: at the last observation.

@@ -29,7 +29,7 @@ KEEP_FOUND = jax.checkpoint_policies.save_only_these_names(_FOUND)
 
 
 def mark_found(tree: PyTree) -> PyTree:
-    """The tree with its arrays named as the result of a search, which `KEEP_FOUND` stores."""
+    """Name arrays as the result of a search, so that `KEEP_FOUND` stores them."""
     return jax.tree.map(
         lambda leaf: checkpoint_name(leaf, _FOUND) if eqx.is_array(leaf) else leaf, tree
     )
@@ -170,7 +170,7 @@ def adapted(
     accept: Bool[Array, "*N"] | bool,
     gained: Float[Array, "*N"] | float,
 ) -> tuple[Float[Array, "*N"], Float[Array, "*N"]]:
-    """Lambda for the next step, and the factor on it should that one not be accepted.
+    """Adapt lambda for the next step, and the factor on it should that one not be accepted.
 
     Args:
         damping: lambda of this step.

@@ -199,7 +199,7 @@ class Preintegrated(eqx.Module):
 
     @staticmethod
     def none(dtype: DTypeLike = float) -> "Preintegrated":
-        """No reading."""
+        """The measurement of an interval without a reading."""
         zero = jnp.zeros(3, dtype)
         return Preintegrated(
             jaxlie.SO3(jnp.asarray([1, 0, 0, 0], dtype)),
@@ -243,7 +243,7 @@ def preintegrate(
     gyro_bias_radps: Float[Array, " 3"] | None = None,
     accel_bias_mps2: Float[Array, " 3"] | None = None,
 ) -> Preintegrated:
-    """The measurement that readings (N,) are together.
+    """Integrate readings (N,) into one measurement.
 
         dR' = dR Exp(w dt),  dv' = dv + dR a dt,  dp' = dp + dv dt + dR a dt^2 / 2
         P' = A P A' + Q

@@ -15,7 +15,6 @@ from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.filter.choose import (
     LowestReprojection,
     Mahalanobis,
-    MeasuredPose,
     ObjectSpace,
     Oracle,
     OrientationGiven,
@@ -143,7 +142,7 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
     assert (measured.innovation is None) == (K == 1)
     assert measured.T_world_vehicle.wxyz_xyz.shape == (K, 7)
     assert measured.covariance.shape == (K, 6, 6)
-    if isinstance(measured, MeasuredPose):
+    if measured.innovation is not None:
         assert measured.innovation.shape == (K, 3)
     for mask in (measured.valid, selection.kept):
         assert mask.shape == (K,)
