@@ -60,10 +60,7 @@ def report_against_truth(
     figure.suptitle(title, fontsize=8.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1))
     position, heading = (figure.add_subplot(grid[row, 0]) for row in range(2))
-    panels = (
-        (position, "position_error_m", _LEAST_M),
-        (heading, "heading_error_deg", _LEAST_DEG),
-    )
+    panels = ((position, "position_error_m", _LEAST_M), (heading, "heading_error_deg", _LEAST_DEG))
     for axes, error, least in panels:
         for drive, style in zip([*drives, *listened], _STYLES, strict=False):
             values = np.maximum(getattr(drive, error), least)

@@ -54,6 +54,7 @@ _SMALLEST_FLIP = 1e-6  # lower end of the axis of the flip probability
 _WIDTH_IN, _MAP_IN, _LANE_IN, _PANEL_IN = 8.0, 4.7, 0.17, 1.05
 
 _Panel = Callable[[Axes, Outcomes], None]
+_Bars = list[tuple[float, float]]
 
 
 def drive_log_report(log: DriveLog, title: str = "") -> Figure:
@@ -77,7 +78,7 @@ def drive_log_report(log: DriveLog, title: str = "") -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, sum(heights) + 0.5), layout="constrained")
     figure.suptitle(title, fontsize=10)
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
-    _draw_map(figure.add_subplot(grid[0]), outcomes, Scenery.of(log.header))
+    _draw_map(figure.add_subplot(grid[0]), outcomes, Scenery.from_header(log.header))
     first = figure.add_subplot(grid[1])
     _draw_lanes(first, outcomes, lanes)
     below = [figure.add_subplot(grid[row], sharex=first) for row in range(2, len(heights))]
@@ -96,7 +97,7 @@ def drive_log_report(log: DriveLog, title: str = "") -> Figure:
     return figure
 
 
-def _lanes(outcomes: Outcomes) -> Iterator[tuple[str, str, np.ndarray]]:
+def _lanes(outcomes: Outcomes) -> Iterator[tuple[str, str, _Bars]]:
     """Name, colour and bars (begin s, duration s) of each flag that was ever raised."""
     for kinds, values, color in (
         (Fault, outcomes.faults, _FAULT),
@@ -105,24 +106,30 @@ def _lanes(outcomes: Outcomes) -> Iterator[tuple[str, str, np.ndarray]]:
         for flag in kinds:
             up = (values & flag.value) > 0
             if up.any():
-                yield flag.name or "", color, _bars(outcomes.times_s, up)
+                least_s = 0.003 * float(outcomes.times_s[-1] - outcomes.times_s[0])  # is visible
+                yield flag.name or "", color, _bars(outcomes.times_s, up, _JOIN_S, least_s)
 
 
-def _bars(times_s: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """The bars (K, 2) of a flag, begin and duration in s, wide enough to be visible."""
-    ends_s = np.append(times_s[1:], times_s[-1])
-    begins_s, ends_s = times_s[up], ends_s[up]
-    apart = np.append(True, begins_s[1:] - ends_s[:-1] > _JOIN_S)
-    first = np.flatnonzero(apart)
-    last = np.append(first[1:] - 1, len(begins_s) - 1)
-    least_s = 0.003 * float(times_s[-1] - times_s[0])
-    return np.column_stack([begins_s[first], np.maximum(ends_s[last] - begins_s[first], least_s)])
+def _bars(
+    times_s: np.ndarray, up: np.ndarray, joined_s: float = 0.0, least_s: float = 0.0
+) -> _Bars:
+    """Begin and duration in s of a flag's bars, up to the next event.
+
+    Args:
+        joined_s: gaps up to this are closed.
+        least_s: a bar is drawn at least so long.
+    """
+    begins_s, ends_s = times_s[up], np.append(times_s[1:], times_s[-1])[up]
+    first = np.flatnonzero(np.append(True, begins_s[1:] - ends_s[:-1] > joined_s)[: len(begins_s)])
+    last = np.append(first[1:], len(begins_s))[: len(first)] - 1
+    lengths_s = np.maximum(ends_s[last] - begins_s[first], least_s)
+    return list(zip(begins_s[first].tolist(), lengths_s.tolist(), strict=True))
 
 
-def _draw_lanes(axes: Axes, outcomes: Outcomes, lanes: list[tuple[str, str, np.ndarray]]) -> None:
+def _draw_lanes(axes: Axes, outcomes: Outcomes, lanes: list[tuple[str, str, _Bars]]) -> None:
     """Draw health on top, and below it a lane for each fault and reject."""
     for state in Health:
-        bars = _runs(outcomes.times_s, outcomes.health == state)
+        bars = _bars(outcomes.times_s, outcomes.health == state)
         axes.broken_barh(bars, (-0.4, 0.8), color=HEALTH_COLORS[state], lw=0)
         for begin_s, length_s in bars:
             if length_s > _LETTER * len(state.name) * outcomes.times_s[-1]:
@@ -131,20 +138,10 @@ def _draw_lanes(axes: Axes, outcomes: Outcomes, lanes: list[tuple[str, str, np.n
                     middle_s, 0, state.name, color="white", fontsize=7, ha="center", va="center"
                 )
     for row, (_, color, lane) in enumerate(lanes, 1):
-        axes.broken_barh([(bar[0], bar[1]) for bar in lane], (row - 0.35, 0.7), color=color, lw=0)
+        axes.broken_barh(lane, (row - 0.35, 0.7), color=color, lw=0)
     axes.set_yticks(range(len(lanes) + 1), ["health", *(name for name, _, _ in lanes)])
     axes.set_ylim(len(lanes) + 0.6, -0.6)
     axes.set_axisbelow(True)
-
-
-def _runs(times_s: np.ndarray, up: np.ndarray) -> list[tuple[float, float]]:
-    """Begin and duration in s of each run of events, up to the next event."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], up.astype(int), [0]])))
-    ends_s = np.append(times_s, times_s[-1])
-    return [
-        (float(times_s[begin]), float(ends_s[end] - times_s[begin]))
-        for begin, end in zip(edges[::2], edges[1::2], strict=True)
-    ]
 
 
 def _draw_doubt(axes: Axes, outcomes: Outcomes) -> None:
@@ -162,13 +159,13 @@ def _draw_doubt(axes: Axes, outcomes: Outcomes) -> None:
 
 
 def _gate_nis(header: dict[str, Any]) -> float:
-    """The gate of the filter that drove, the default one where the header tells none; inf: none."""
+    """The gate of the filter that drove, the default one where the header names none; inf: none."""
     if isinstance(SELECTORS.get(str(header.get("selector"))), Ungated):
         return math.inf
     parameters = header.get("parameters")
-    told = parameters.get("motion.gate_nis") if isinstance(parameters, dict) else None
-    if isinstance(told, int | float) and told > 0:
-        return float(told)
+    given = parameters.get("motion.gate_nis") if isinstance(parameters, dict) else None
+    if isinstance(given, int | float) and given > 0:
+        return float(given)
     return float(BicycleKalman.gate_nis)
 
 
@@ -189,20 +186,16 @@ def _draw_nis(axes: Axes, outcomes: Outcomes, gate_nis: float) -> None:
 
 def _draw_commands(axes: Axes, outcomes: Outcomes) -> None:
     """Of a car throttle and steering; of another base its speeds, and how fast it turns."""
+    label, turn = "throttle", "steering (deg)"
+    lines, turns = [outcomes.throttle], outcomes.steering_rad
     if not np.isnan(outcomes.twist).all():
-        for part, color in enumerate((BLUE, GREEN)):
-            speeds_mps = outcomes.twist[:, part]
-            axes.step(outcomes.times_s, speeds_mps, where="post", color=color, lw=1.2)
-        axes.set_ylabel("ahead, left (m/s)", color=BLUE)
-        right = _right_of(axes, "turn (deg/s)")
-        turns = np.rad2deg(outcomes.twist[:, 2])
-        right.step(outcomes.times_s, turns, where="post", color=VERMILION, lw=1.2, ls="--")
-        return
-    axes.step(outcomes.times_s, outcomes.throttle, where="post", color=BLUE, lw=1.2)
-    axes.set_ylabel("throttle", color=BLUE)
-    right = _right_of(axes, "steering (deg)")
-    steering_deg = np.rad2deg(outcomes.steering_rad)
-    right.step(outcomes.times_s, steering_deg, where="post", color=VERMILION, lw=1.2, ls="--")
+        *lines, turns = outcomes.twist.T
+        label, turn = "ahead, left (m/s)", "turn (deg/s)"
+    for line, color in zip(lines, (BLUE, GREEN), strict=False):
+        axes.step(outcomes.times_s, line, where="post", color=color, lw=1.2)
+    axes.set_ylabel(label, color=BLUE)
+    right = _right_of(axes, turn)
+    right.step(outcomes.times_s, np.rad2deg(turns), where="post", color=VERMILION, lw=1.2, ls="--")
 
 
 def _draw_sigma(axes: Axes, outcomes: Outcomes) -> None:
@@ -272,8 +265,13 @@ def _draw_map(axes: Axes, outcomes: Outcomes, scenery: Scenery) -> None:
     axes.set_ylabel("y (m)", fontsize=9)
     axes.grid(alpha=0.3)
     axes.tick_params(labelsize=8)
+    health = [
+        Line2D([], [], color=HEALTH_COLORS[state], lw=2.5, label=state.name)
+        for state in sorted(Health)
+        if state in outcomes.health
+    ]
     axes.legend(
-        handles=[*_health_handles(outcomes.health), *axes.get_legend_handles_labels()[0]],
+        handles=[*health, *axes.get_legend_handles_labels()[0]],
         loc="upper center",
         bbox_to_anchor=(0.5, -0.13),
         ncols=4,
@@ -302,14 +300,6 @@ def _draw_track(axes: Axes, track_m: np.ndarray, health: np.ndarray) -> None:
     )
 
 
-def _health_handles(health: np.ndarray) -> list[Line2D]:
-    return [
-        Line2D([], [], color=HEALTH_COLORS[state], lw=2.5, label=state.name)
-        for state in sorted(Health)
-        if state in health
-    ]
-
-
 def _draw_ellipses(axes: Axes, outcomes: Outcomes, known: np.ndarray) -> None:
     """Draw the 95 % ellipses of the vehicle's position, evenly spaced in time."""
     for number, index in enumerate(known[_evenly(len(known), _ELLIPSES)]):
@@ -317,21 +307,13 @@ def _draw_ellipses(axes: Axes, outcomes: Outcomes, known: np.ndarray) -> None:
         if covariance.shape != (2, 2) or not np.isfinite(covariance).all():
             continue
         variances, vectors = np.linalg.eigh(covariance)
-        lengths_m = 2 * np.sqrt(_CHI2_2DOF_95 * np.maximum(variances, 0))
+        short_m, long_m = 2 * np.sqrt(_CHI2_2DOF_95 * np.maximum(variances, 0))
         angle_deg = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-        axes.add_patch(
-            Ellipse(
-                (outcomes.pose[index, 0], outcomes.pose[index, 1]),
-                lengths_m[1],
-                lengths_m[0],
-                angle=angle_deg,
-                facecolor="none",
-                edgecolor=BLACK,
-                lw=0.9,
-                zorder=5,
-                label="95 % ellipse" if number == 0 else None,
-            )
-        )
+        x_m, y_m, _ = outcomes.pose[index]
+        ellipse = Ellipse((x_m, y_m), long_m, short_m, angle=angle_deg)
+        ellipse.set(facecolor="none", edgecolor=BLACK, lw=0.9, zorder=5)
+        ellipse.set_label("95 % ellipse" if number == 0 else "")
+        axes.add_patch(ellipse)
 
 
 def _candidate_poses(outcomes: Outcomes) -> dict[bool, np.ndarray]:
@@ -364,16 +346,10 @@ def _draw_headings(axes: Axes, rows: np.ndarray, color: str, marker: str, label:
         return
     x_m, y_m, psi_rad = rows.T
     axes.plot(x_m, y_m, marker, color=color, ms=4, label=label, zorder=2)
-    ahead = np.cos(psi_rad), np.sin(psi_rad)
     axes.quiver(
-        *(x_m, y_m, *ahead),
-        color=color,
-        scale_units="inches",
-        scale=7,
-        width=0.0022,
-        headwidth=0,
-        zorder=2,
-    )
+        x_m, y_m, np.cos(psi_rad), np.sin(psi_rad), color=color, zorder=2,
+        scale_units="inches", scale=7, width=0.0022, headwidth=0,
+    )  # fmt: skip
 
 
 def _evenly(count: int, most: int) -> np.ndarray:

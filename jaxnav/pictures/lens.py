@@ -97,23 +97,13 @@ def _draw_residuals(axes: Axes, calibration: LensCalibration, seen: Cells) -> No
     magnified = _round_down(_ARROW * cell_px / max(length_px.max(initial=0), 1e-9))
     axes.set_title(f"mean residual (predicted - seen), {magnified:g} times", loc="left")
     arrows = axes.quiver(
-        *seen.middle_px[filled].T,
-        *seen.mean_px[filled].T,
-        angles="xy",
-        scale_units="xy",
-        scale=1 / magnified,
-        color=BLACK,
-        width=0.004,
-    )
+        *seen.middle_px[filled].T, *seen.mean_px[filled].T, color=BLACK, width=0.004,
+        angles="xy", scale_units="xy", scale=1 / magnified,
+    )  # fmt: skip
     key_px = _round_down(_ARROW * cell_px / magnified)
     axes.quiverkey(arrows, 0.9, -0.16, key_px, f"{key_px:g} px", labelpos="E")
-    axes.set(
-        xlabel="x (px)",
-        ylabel="y (px)",
-        xlim=(-0.5, width - 0.5),
-        ylim=(height - 0.5, -0.5),
-        aspect="equal",
-    )
+    axes.set(xlabel="x (px)", ylabel="y (px)", aspect="equal")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 
 def _draw_coverage(axes: Axes, calibration: LensCalibration, seen: Cells) -> None:

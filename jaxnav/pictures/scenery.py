@@ -58,8 +58,8 @@ class Scenery:
         return np.asarray(points_in_world(places_m, opposite(self.origin_m)))
 
     @staticmethod
-    def of(header: dict[str, Any]) -> "Scenery":
-        """The scenery in the header of a recording."""
+    def from_header(header: dict[str, Any]) -> "Scenery":
+        """Read the scenery from the header of a recording."""
         rig = _read(RigFile, header.get("rig"))
         markers = _read(MarkerFile, header.get("markers"))
         route = _read(_RouteEntry, header.get("route")) or _RouteEntry()

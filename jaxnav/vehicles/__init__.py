@@ -1,1 +1,1 @@
-"""The vehicles and cameras of jaxnav: plug-ins like any other, see `loop.interfaces`."""
+"""The vehicles and cameras of jaxnav: plug-ins like any other, see `jaxnav.drive.interfaces`."""

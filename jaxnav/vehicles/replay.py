@@ -23,15 +23,7 @@ import numpy as np
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections
-from jaxnav.drive.interfaces import (
-    AnyVehicle,
-    Camera,
-    Frame,
-    GyroReading,
-    OwnFiles,
-    Reading,
-    Setup,
-)
+from jaxnav.drive.interfaces import AnyVehicle, Camera, Frame, GyroReading, OwnFiles, Reading, Setup
 from jaxnav.drive.standing_clock import WaitingClock
 from jaxnav.errors import BadInput
 from jaxnav.files.images import decode_image

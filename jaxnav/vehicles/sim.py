@@ -12,15 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxnav.drive.corrections import Corrections
-from jaxnav.drive.interfaces import (
-    AnyVehicle,
-    Camera,
-    Frame,
-    GyroReading,
-    HasTime,
-    Odometry,
-    Setup,
-)
+from jaxnav.drive.interfaces import AnyVehicle, Camera, Frame, GyroReading, HasTime, Odometry, Setup
 from jaxnav.drive.limits import limits_of
 from jaxnav.drive.standing_clock import WaitingClock
 from jaxnav.errors import BadInput

@@ -15,7 +15,6 @@ from jaxtyping import Float
 
 from jaxnav.core.control import Command, TwistCommand
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
-from jaxnav.core.models.imu import Gyro
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase
@@ -89,18 +88,20 @@ class SimWorld:
         # Commands and the times at which they act: the last one that is due is obeyed.
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(begin_ns, rest)])
         self._written_ns = self._gyro_ns = begin_ns
-        self._gyro = None if vehicle.gyro is None else _Gyro.switched_on(vehicle.gyro, seed)
+        # Of the gyro, whose bias does not walk; numbers that no other sensor uses.
+        normal = np.random.default_rng([seed, 1]).standard_normal(3)
+        self._gyro_bias, self._gyro_scale, self._gyro_late = normal.tolist()
         self._held = False
         self._acts: Callable[[tuple[float, ...]], tuple[float, ...]] = lambda command: command
         self._reads: Callable[..., tuple[float, ...]] = lambda read, command: read
 
-    def write(self, *told: float) -> None:
+    def write(self, *command_and_ns: float) -> None:
         """Take a command, which acts after the actuation delay.
 
         Args:
-            told: its numbers, and then the time, ns.
+            command_and_ns: its numbers, and then the time, ns.
         """
-        command, now_ns = told[:-1], int(told[-1])
+        command, now_ns = command_and_ns[:-1], int(command_and_ns[-1])
         with self._lock:
             self._advance(now_ns)
             due_ns = now_ns + int(self.settings.actuation_delay_s * 1e9)
@@ -215,19 +216,24 @@ class SimWorld:
 
         It keeps those of half a second.
         """
+        gyro = self.vehicle.gyro
         readings: list[GyroReading] = []
         self._gyro_ns = max(self._gyro_ns, until_ns - _GYRO_KEPT * _GYRO_NS)
-        while self._gyro is not None and self._gyro_ns + _GYRO_NS <= until_ns:
+        while gyro is not None and self._gyro_ns + _GYRO_NS <= until_ns:
             begin_ns, self._gyro_ns = self._gyro_ns, self._gyro_ns + _GYRO_NS
-            late_ns = self._gyro.late_ns
+            late_s = float(gyro.delay_s) + float(gyro.delay_sigma_s) * self._gyro_late
             begin_rad, end_rad = (
-                self.state(max(at_ns - late_ns, self._track[0][0]))[2]
+                self.state(max(at_ns - int(max(late_s, 0.0) * 1e9), self._track[0][0]))[2]
                 for at_ns in (begin_ns, self._gyro_ns)
             )
-            turned_rad = float(end_rad - begin_rad)
             with self._lock:
                 error = float(self.rng.standard_normal())
-            rate = self._gyro.rate_radps(turned_rad, _GYRO_NS / 1e9, error)
+            dt_s, most = _GYRO_NS / 1e9, float(gyro.saturation_radps)
+            scale = 1 + float(gyro.scale_sigma) * self._gyro_scale
+            rate = scale * float(end_rad - begin_rad) / dt_s
+            rate += float(gyro.bias_sigma_radps) * self._gyro_bias
+            rate += float(gyro.noise_density) / math.sqrt(dt_s) * error
+            rate = float(min(max(rate, -most), most))
             readings.append(GyroReading(begin_ns + _GYRO_NS // 2, rate))
         return tuple(readings)
 
@@ -272,32 +278,3 @@ class SimWorld:
         if silent_s <= self.settings.vehicle_timeout_s:
             return command
         return (command[0], 0.0) if len(command) == 2 else (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class _Gyro:
-    """What one drive's gyro gets wrong; see `Gyro`. Its bias does not walk."""
-
-    gyro: Gyro
-    bias_radps: float
-    scale: float
-    late_ns: int
-
-    @staticmethod
-    def switched_on(gyro: Gyro, seed: int) -> "_Gyro":
-        """Errors as the gyro tells of them; its numbers are not those of the other sensors."""
-        bias, scale, late = np.random.default_rng([seed, 1]).standard_normal(3)
-        late_s = float(gyro.delay_s) + float(gyro.delay_sigma_s) * late
-        return _Gyro(
-            gyro,
-            float(gyro.bias_sigma_radps) * bias,
-            1 + float(gyro.scale_sigma) * scale,
-            int(max(late_s, 0.0) * 1e9),
-        )
-
-    def rate_radps(self, turned_rad: float, dt_s: float, error: float) -> float:
-        """The mean rate that is read of a turn; `error` is a standard normal number."""
-        rate = self.scale * turned_rad / dt_s + self.bias_radps
-        rate += float(self.gyro.noise_density) / math.sqrt(dt_s) * error
-        most = float(self.gyro.saturation_radps)
-        return min(max(rate, -most), most)

@@ -18,7 +18,7 @@ from jaxnav.detection.crowd import thin_crowd
 from jaxnav.detection.families import all_cells
 from jaxnav.detection.refine import mean_side_px
 from jaxnav.errors import BadInput
-from jaxnav.experiments.studies.damage import check_sizes
+from jaxnav.experiments.studies.store import check_sizes
 from jaxnav.files import limits
 from jaxnav.files.image_headers import image_size_px
 from jaxnav.files.images import decode_image, image_problem, read_image

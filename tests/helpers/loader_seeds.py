@@ -201,12 +201,13 @@ def _stored(which: str) -> Loader:
 
     def make(folder: Path) -> Path:
         (folder / "study.yaml").write_text(STUDY)
-        store = open_store(folder / "s.zarr", load_study("ambiguity", folder / "study.yaml"))
+        study = load_study("ambiguity", folder / "study.yaml")
+        store = open_store(folder / "s.zarr", study)
         rng = np.random.default_rng(0)
         for box in list(store.missing()):
             *outer, trials = (part.stop - part.start for part in store.layout.region(box))
             found = {}
-            for name, variable in store.study.schema.variables.items():
+            for name, variable in study.schema.variables.items():
                 inner = (2,) if variable.of_selector else ()
                 most = len(variable.outcomes) or 2
                 numbers = rng.uniform(0, most, (math.prod(outer), *inner, trials))

@@ -1,7 +1,6 @@
 """The picture and the summary of a recorded drive show its content, whatever it is."""
 
 import dataclasses
-import io
 import math
 import sys
 from pathlib import Path
@@ -29,6 +28,7 @@ from jaxnav.recordings.drive_log import DriveLog, read_drive
 from jaxnav.recordings.messages import input_message
 from jaxnav.recordings.recorder import Recorder
 from tests.helpers.drives import record_drive
+from tests.pictures.test_plotting import rendered
 
 QCAR = calib_dir() / "qcar"
 HEADER = {
@@ -77,12 +77,6 @@ def changed(log: DriveLog, **arrays: object) -> DriveLog:
 
 def during(begin_s: float, end_s: float, value: int) -> np.ndarray:
     return np.where((begin_s <= TIMES_S) & (end_s > TIMES_S), value, 0)
-
-
-def rendered(figure: Figure) -> bytes:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=40)
-    return stream.getvalue()
 
 
 def lanes(figure: Figure) -> dict[str, list[tuple[float, float]]]:
@@ -234,7 +228,7 @@ def test_there_must_be_something_to_draw(tmp_path):
 
 
 def test_the_scenery_is_that_of_the_files():
-    scenery = Scenery.of(HEADER)
+    scenery = Scenery.from_header(HEADER)
     rig, markers = load_rig(QCAR / "rig.yaml"), load_markers(QCAR / "markers.yaml")
     assert scenery.rig.names == rig.names
     np.testing.assert_array_equal(
@@ -247,7 +241,7 @@ def test_the_scenery_is_that_of_the_files():
 
 @pytest.mark.parametrize("value", [None, 1, "- {", [], {}, {"waypoints_m": 1, "cameras": 2}])
 def test_a_scenery_of_another_form_is_left_out(value):
-    scenery = Scenery.of({"rig": value, "markers": value, "route": value})
+    scenery = Scenery.from_header({"rig": value, "markers": value, "route": value})
     assert (scenery.rig, scenery.markers) == (None, None)
     assert (scenery.waypoints_m.shape, scenery.markers_m.shape) == ((0, 2), (0, 4, 3))
 

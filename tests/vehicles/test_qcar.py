@@ -113,10 +113,28 @@ def test_no_command_is_beyond_the_limits(first_rad, steering_rad, throttle, limi
     vehicle.close()
 
 
+def begun_thread(target, *args) -> threading.Thread:
+    thread = threading.Thread(target=target, args=args)
+    thread.start()
+    return thread
+
+
+class Held:
+    """A function that tells when it has begun, and waits until it is let go."""
+
+    def __init__(self, function):
+        self.function, self.begun, self.let_go = function, threading.Event(), threading.Event()
+
+    def __call__(self, *command):
+        if command[0] != 0:  # a stop's zero throttle passes
+            self.begun.set()
+            self.let_go.wait(5.0)
+        return self.function(*command)
+
+
 def test_stop_does_not_wait_for_a_driver_that_hangs(hardware, car):
     hardware.hangs = threading.Event()
-    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
-    driving.start()
+    driving = begun_thread(car.write, 0.0, 0.2)
     while hardware.throttle == 0:
         time.sleep(0.001)
     begin_s = time.monotonic()
@@ -130,21 +148,12 @@ def test_stop_does_not_wait_for_a_driver_that_hangs(hardware, car):
 
 def test_a_write_that_comes_late_is_undone(hardware, car, monkeypatch):
     """The driver hangs before it sends: the stop comes first, the old throttle after it."""
-    begun, let_go = threading.Event(), threading.Event()
-    send = hardware.write
-
-    def slow(throttle, steering):
-        if throttle != 0:
-            begun.set()
-            let_go.wait(5.0)
-        send(throttle, steering)
-
+    slow = Held(hardware.write)
     monkeypatch.setattr(hardware, "write", slow)
-    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
-    driving.start()
-    begun.wait(5.0)
+    driving = begun_thread(car.write, 0.0, 0.2)
+    slow.begun.wait(5.0)
     car.stop()
-    let_go.set()
+    slow.let_go.set()
     driving.join()
     assert hardware.throttle == 0
     car.read()
@@ -153,49 +162,33 @@ def test_a_write_that_comes_late_is_undone(hardware, car, monkeypatch):
 
 def test_a_stop_while_a_command_is_made_is_not_lost(hardware, car, monkeypatch):
     """The lock is taken and nothing is sent yet: the stop comes and goes in between."""
-    begun, let_go = threading.Event(), threading.Event()
-
-    def slow(*command):
-        begun.set()
-        let_go.wait(5.0)
-        return 0.0, 0.2
-
+    slow = Held(lambda *command: (0.0, 0.2))
     monkeypatch.setattr(car, "_limits", SimpleNamespace(apply=slow))
-    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
-    driving.start()
-    begun.wait(5.0)
+    driving = begun_thread(car.write, 0.1, 0.2)
+    slow.begun.wait(5.0)
     car.stop()
-    let_go.set()
+    slow.let_go.set()
     driving.join()
     assert hardware.throttle == 0
 
 
 def test_a_write_that_overtakes_a_stop_and_hangs_is_undone(hardware, car, monkeypatch):
     """The stop asks for the lock first, the write gets it, and sends after the stop gave up."""
-    asked, begun, let_go = threading.Event(), threading.Event(), threading.Event()
-    send = hardware.write
+    asked, slow = threading.Event(), Held(hardware.write)
 
     class Unfair(contextlib.nullcontext):
         def acquire(self, timeout):
             asked.set()
-            begun.wait(5.0)
+            slow.begun.wait(5.0)
             return False
-
-    def slow(throttle, steering):
-        if throttle != 0:
-            begun.set()
-            let_go.wait(5.0)
-        send(throttle, steering)
 
     monkeypatch.setattr(hardware, "write", slow)
     monkeypatch.setattr(car, "_driver", Unfair())
-    stopping = threading.Thread(target=car.stop)
-    stopping.start()
+    stopping = begun_thread(car.stop)
     asked.wait(5.0)
-    driving = threading.Thread(target=car.write, args=(0.0, 0.2))
-    driving.start()
+    driving = begun_thread(car.write, 0.0, 0.2)
     stopping.join()
-    let_go.set()
+    slow.let_go.set()
     driving.join()
     assert hardware.throttle == 0
 
@@ -231,27 +224,26 @@ def test_options_reach_the_driver(hardware):
     assert (hardware.car.readMode, hardware.car.frequency) == (1, 200)
 
 
+def cameras(setup):
+    return open_cameras(setup, None)
+
+
 @pytest.mark.parametrize(
-    ("option", "value", "problem"),
+    ("opens", "option", "value", "problem"),
     [
-        ("frequency", "fast", "--option frequency: expected a number from 100 to 1000, got 'fast'"),
-        ("frequency", "nan", "--option frequency: expected a number from 100 to 1000"),
-        ("frequency", "20", "--option frequency: expected a number from 100 to 1000"),
-        ("frequency", "150.5", "--option frequency: expected a whole number, got '150.5'"),
-        ("read_mode", "2", "--option read_mode: expected a number from 0 to 1"),
+        (open_vehicle, "frequency", "fast", "expected a number from 100 to 1000, got 'fast'"),
+        (open_vehicle, "frequency", "nan", "expected a number from 100 to 1000"),
+        (open_vehicle, "frequency", "20", "expected a number from 100 to 1000"),
+        (open_vehicle, "frequency", "150.5", "expected a whole number, got '150.5'"),
+        (open_vehicle, "read_mode", "2", "expected a number from 0 to 1"),
+        (cameras, "frame_rate", "0", "expected a number"),
+        (cameras, "latency_ms", "-1", "expected a number"),
+        (cameras, "latency_ms", "inf", "expected a number"),
     ],
 )
-def test_a_wrong_option_is_named(hardware, option, value, problem):
-    with pytest.raises(BadInput, match=problem):
-        open_vehicle(setup_with(**{option: value}))
-
-
-@pytest.mark.parametrize(
-    ("option", "value"), [("frame_rate", "0"), ("latency_ms", "-1"), ("latency_ms", "inf")]
-)
-def test_a_wrong_option_of_the_cameras_is_named(hardware, option, value):
-    with pytest.raises(BadInput, match=f"--option {option}: expected a number"):
-        open_cameras(setup_with(**{option: value}), None)
+def test_a_wrong_option_is_named(hardware, opens, option, value, problem):
+    with pytest.raises(BadInput, match=f"--option {option}: {problem}"):
+        opens(setup_with(**{option: value}))
 
 
 def rig_with(names=None, sizes_px=None):

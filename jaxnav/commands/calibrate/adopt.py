@@ -13,7 +13,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files import output_folder
 from jaxnav.files.vehicles import as_car
 from jaxnav.files.writing import atomic_write_all
-from jaxnav.pictures.learnt import learnt_over_time
+from jaxnav.pictures.odometry import learnt_over_time
 from jaxnav.recordings.adoption import (
     NEVER_SURE,
     NOTHING_KEPT,

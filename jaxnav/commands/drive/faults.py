@@ -1,7 +1,5 @@
 """`jaxnav faults`: drive with every fault of the matrix, and print a table."""
 
-from dataclasses import asdict
-
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Faults
 from jaxnav.commands.process import configure_jax
@@ -51,6 +49,6 @@ def _as_json(result: Result) -> dict[str, object]:
         "error_after_m": result.error_after_m,
         "recovered_s": result.recovered_s,
         "restarts": result.restarts,
-        "ways": asdict(result.ways),
+        "ways": result.ways_m,
         "broken": list(result.broken),
     }

@@ -17,7 +17,7 @@ def run(args: Arguments) -> int:
     """Show the whole drive, and leave the window open."""
     import_rerun()
     log = read_outcomes(args.recording, args.headless)
-    scenery = Scenery.of(log.header)
+    scenery = Scenery.from_header(log.header)
     if args.out is not None:
         output_folder(args.out.parent)
     with ExitStack() as stack:

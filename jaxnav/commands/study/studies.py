@@ -10,11 +10,9 @@ import xarray as xr
 
 from jaxnav.errors import BadInput
 from jaxnav.experiments.studies.ambiguity import AmbiguityStudy
-from jaxnav.experiments.studies.config import Config
-from jaxnav.experiments.studies.damage import check_layout, check_trials, reading
 from jaxnav.experiments.studies.drives import DriveStudy
-from jaxnav.experiments.studies.store import count_done, read_attributes, read_dataset, read_layout
-from jaxnav.experiments.studies.study import Grid, Study
+from jaxnav.experiments.studies.store import StudyStore, reading
+from jaxnav.experiments.studies.study import Config, Study
 from jaxnav.experiments.studies.summary import summarise
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.files.reading import read_mapping
@@ -42,7 +40,7 @@ def load_study(kind: str, path: Path) -> Study:
     data = read_mapping(path)
     calibration = _calibration(data, path, kind)
     files = {name: _digest(file) for name, file in calibration.items()}
-    config = Config.parse(kind, KINDS[kind].schema.parameters, data, path, files)
+    config = Config.parse(KINDS[kind].schema, data, path, files)
     with jax.enable_x64(True):  # as exact as the files are; a study rounds to its own precision
         rig = load_rig(calibration["rig"]) if "rig" in calibration else None
         markers = load_markers(calibration["markers"]) if "markers" in calibration else None
@@ -72,25 +70,18 @@ def summary_of(path: Path, bar: Any) -> tuple[str, int, xr.Dataset]:
     Raises:
         BadInput: the path is not a store of a study.
     """
-    grid = _stored_grid(path)
-    layout, trials = read_layout(path), read_dataset(path)
-    check_layout(path, layout, grid)
-    check_trials(path, trials, grid)
-    bar.reset(total=layout.trials)
-    with reading(path):  # box by box, while it is summed up
-        summary = summarise(trials, grid, layout, bar.update)
-    return grid.config.kind, count_done(path), summary
-
-
-def _stored_grid(path: Path) -> Grid:
-    """The grid of a store by its stored config, which is checked as if a person had written it."""
-    stored = read_attributes(path)["config"]
-    kind = stored.get("kind")
+    store = StudyStore(path)
+    # The stored config is checked as if a person had written it.
+    kind = store.config.pop("kind", None)
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadInput(f"{path}: config.kind", f"must be {' or '.join(KINDS)}, got {kind!r}")
-    schema = KINDS[kind].schema
-    data = {key: value for key, value in stored.items() if key not in ("kind", "files")}
-    return Grid(schema, Config.parse(kind, schema.parameters, data, f"{path}: config"))
+    data = {key: value for key, value in store.config.items() if key != "files"}
+    config = Config.parse(KINDS[kind].schema, data, f"{path}: config")
+    trials = store.dataset(config)
+    bar.reset(total=store.layout.trials)
+    with reading(path):  # box by box, while it is summed up
+        summary = summarise(trials, config, store.layout, bar.update)
+    return kind, store.count_done(), summary
 
 
 def _calibration(data: Mapping[str, Any], path: Path, kind: str) -> dict[str, Path]:

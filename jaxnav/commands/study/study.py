@@ -18,7 +18,7 @@ from jaxnav.experiments.studies.running import (
     run_here,
     run_on_cluster,
 )
-from jaxnav.experiments.studies.store import count_done, open_store, sweep_unfinished
+from jaxnav.experiments.studies.store import open_store, sweep_unfinished
 from jaxnav.files import output_folder
 from jaxnav.files.locking import sole_writer
 
@@ -37,7 +37,7 @@ def run(args: Arguments) -> int:
         sweep_unfinished(path)
         client = _cluster(args, stack)
         store = open_store(path, study, args.chunk_trials)
-        total, done = store.layout.trials, count_done(path)
+        total, done = store.layout.trials, store.count_done()
         if 0 < done < total:
             print(f"{visible(path)} holds {done} of {total} trials: going on", flush=True)
         bar = stack.enter_context(
@@ -48,14 +48,14 @@ def run(args: Arguments) -> int:
         update = update_after_compiling(bar)
         try:
             if client is None:
-                run_here(store, update)
+                run_here(study, store, update)
             else:
                 flag = "--workers" if args.scheduler is None else "--scheduler"
-                run_on_cluster(store, client, flag, update)
+                run_on_cluster(study, store, client, flag, update)
         except KeyboardInterrupt:
             bar.close()
             print(
-                f"interrupted: {count_done(path)} of {total} trials are in {path}; "
+                f"interrupted: {store.count_done()} of {total} trials are in {path}; "
                 "the same command goes on"
             )
             return EXIT_INTERRUPTED

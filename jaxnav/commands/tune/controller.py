@@ -102,7 +102,9 @@ def gains_of(args: Arguments, navigator: Navigator) -> Space:
         if name not in known:
             expected = ", ".join(known)
             raise BadInput("--train", f"there is no {name} to learn: expected one of {expected}")
-    return Space.of(navigator, dict.fromkeys(args.train or _by_default(navigator), True))
+    return Space.from_navigator(
+        navigator, dict.fromkeys(args.train or _by_default(navigator), True)
+    )
 
 
 def _by_default(navigator: Navigator) -> tuple[str, ...]:

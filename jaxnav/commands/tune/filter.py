@@ -76,7 +76,7 @@ def space_of(args: Arguments, navigator: Navigator, learned: FrameSequences) -> 
                 problem = f"there is no {name} to learn in this filter: expected one of {expected}"
                 raise BadInput(flag, problem)
     try:
-        return Space.of(navigator, dict.fromkeys(names, True), frozenset(args.full))
+        return Space.from_navigator(navigator, dict.fromkeys(names, True), frozenset(args.full))
     except ValueError as error:
         raise BadInput("--full", str(error)) from None
 

@@ -24,7 +24,6 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.refine import Candidates
-from jaxnav.experiments.studies.config import Config
 from jaxnav.experiments.studies.lanes import in_precision, run_lanes
 from jaxnav.experiments.studies.parameters import (
     RANDOM,
@@ -33,7 +32,16 @@ from jaxnav.experiments.studies.parameters import (
     positive,
     told_noise_px,
 )
-from jaxnav.experiments.studies.study import Cell, Progress, Rate, Schema, Study, Variable, nobody
+from jaxnav.experiments.studies.study import (
+    Cell,
+    Config,
+    Progress,
+    Rate,
+    Schema,
+    Study,
+    Variable,
+    nobody,
+)
 from jaxnav.sim.single_frames import (
     CornerErrors,
     MarkerView,
@@ -67,7 +75,9 @@ PARAMETERS = {
     "marker_size_m": positive("side of the black square", "m", 0.172),
     "focal_px": positive("of every camera; by default 320, or a rig file's own", "px", None),
     "corner_noise_px": _error("standard deviation of a corner coordinate", 0.5),
-    "corner_bias_px": _error("of every corner, in a direction of its own, never told", 0.0),
+    "corner_bias_px": _error(
+        "of every corner, in a direction of its own, unknown to the estimator", 0.0
+    ),
     "blur_px": _error("length of a streak, each corner is found anywhere in it", 0.0),
     "told_noise_px": positive("sigma the estimator is told (R); else the noise", "px", None),
     "prior_position_sigma_m": positive("of a prediction's error; by default none", "m", None),

@@ -20,10 +20,18 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
-from jaxnav.experiments.studies.config import Config
 from jaxnav.experiments.studies.lanes import in_precision
 from jaxnav.experiments.studies.parameters import Parameter, cameras, positive, told_noise_px
-from jaxnav.experiments.studies.study import Cell, Progress, Rate, Schema, Study, Variable, nobody
+from jaxnav.experiments.studies.study import (
+    Cell,
+    Config,
+    Progress,
+    Rate,
+    Schema,
+    Study,
+    Variable,
+    nobody,
+)
 from jaxnav.sim.bases import BASES, IMUS, equipped
 from jaxnav.sim.rollout import Rollout, Trace
 from jaxnav.sim.scenarios import Scenario, on_laps, scenarios
@@ -36,7 +44,7 @@ _MANY_TRIALS = 8192
 
 
 def _error(description: str, unit: str, high: float, low: float = 0.0) -> Parameter:
-    """A parameter for an error that the navigator is not told, by default the scenario's."""
+    """A parameter for an error that the navigator does not know of, by default the scenario's."""
     described = f"{description}; else the scenario's"
     return Parameter(described, unit, None, low=low, high=high, static=True)
 

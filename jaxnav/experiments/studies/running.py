@@ -24,38 +24,38 @@ _IN_FLIGHT = 2  # boxes for each worker, so that no worker waits for its next on
 _PATIENCE_S = 30.0  # for a cluster without workers
 
 
-def run_here(store: StudyStore, progress: Progress = nobody) -> None:
+def run_here(study: Study, store: StudyStore, progress: Progress = nobody) -> None:
     """Run the missing boxes in this process, on all its devices; write each while the next runs.
 
     Raises:
         BadInput: the store can't be written to.
     """
 
-    def keep(box: Box, results: Mapping[str, np.ndarray], told: list[int]) -> None:
+    def keep(box: Box, results: Mapping[str, np.ndarray], reported: list[int]) -> None:
         store.write(box, results)
-        progress(store.layout.size(box) - sum(told))
+        progress(store.layout.size(box) - sum(reported))
 
     with ThreadPoolExecutor(1) as writer:
         writing: Future[None] | None = None
         try:
             for box in store.missing():
-                told: list[int] = []  # how many trials of this box have ended
+                reported: list[int] = []  # how many trials of this box have ended
 
-                def tell(ended: int, told: list[int] = told) -> None:
-                    told.append(ended)
+                def report(ended: int, reported: list[int] = reported) -> None:
+                    reported.append(ended)
                     progress(ended)
 
-                results = store.study.run(*_task(store, box), tell)
+                results = study.run(*_task(study, store, box), report)
                 if writing is not None:
                     writing.result()
-                writing = writer.submit(keep, box, results, told)
+                writing = writer.submit(keep, box, results, reported)
         finally:
             if writing is not None:
                 writing.result()
 
 
 def run_on_cluster(
-    store: StudyStore, client: "Client", where: str, progress: Progress = nobody
+    study: Study, store: StudyStore, client: "Client", where: str, progress: Progress = nobody
 ) -> None:
     """Run the missing boxes on a cluster's workers.
 
@@ -83,7 +83,8 @@ def run_on_cluster(
                 box = next(waiting, None)
                 if box is None:
                     break
-                future = client.submit(run_box, store.study, *_task(store, box), wanted, pure=False)
+                task = _task(study, store, box)
+                future = client.submit(run_box, study, *task, wanted, pure=False)
                 running[future] = box
             if not running:
                 return
@@ -131,9 +132,10 @@ def run_box(
     return study.run(cells, trials)
 
 
-def _task(store: StudyStore, box: Box) -> tuple[list[Cell], range]:
-    last = store.layout.region(box)[-1]
-    return [store.study.grid.cell(i) for i in store.layout.cells(box)], range(last.start, last.stop)
+def _task(study: Study, store: StudyStore, box: Box) -> tuple[list[Cell], range]:
+    trials = store.layout.region(box)[-1]
+    cells = [study.config.cell(index) for index in store.layout.cells(box)]
+    return cells, range(trials.start, trials.stop)
 
 
 @contextmanager

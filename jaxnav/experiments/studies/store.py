@@ -1,17 +1,21 @@
 """Keep results on disk, one Zarr store per study, which xarray can open.
 
-A box is written whole and only then marked as done, so a killed study continues where it stopped.
-A store belongs to one config and to one set of versions; others are refused.
+The grid is cut into boxes of cells and trials. A box is written whole, as one chunk, and only then
+marked as done, so a killed study continues where it stopped. A store belongs to one config and to
+one set of versions; others are refused.
 """
 
 import glob
+import itertools
 import json
 import math
 import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -25,16 +29,15 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from zarr.errors import ZarrUserWarning
 
 from jaxnav.errors import BadInput
-from jaxnav.experiments.studies.config import difference
-from jaxnav.experiments.studies.damage import check_layout, check_sizes, layout_of, reading
-from jaxnav.experiments.studies.layout import BoxLayout
-from jaxnav.experiments.studies.study import Study, Variable
+from jaxnav.experiments.studies.study import Config, Study
+from jaxnav.files import limits
 from jaxnav.files.reading import check_regular
 
-_DONE = "done"
+_DONE = "done"  # the array of marks: 1 where a box is done
 # Both with checksums, so that a number changed by the disk is not taken for a result.
 _CHECKED, _COMPRESSED = Crc32cCodec(), ZstdCodec(level=0, checksum=True)
 _PACKAGES = ("jaxnav", "jax", "jaxlib", "equinox", "optimistix", "numpy")
+_LONGEST = 200  # characters kept of a library's message on broken bytes; it may quote them all
 Box = tuple[int, ...]
 
 
@@ -43,21 +46,69 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in _PACKAGES} | {"backend": jax.default_backend()}
 
 
-class StudyStore:
-    """The store of one study."""
+@dataclass(frozen=True)
+class BoxLayout:
+    """A grid of cells and trials cut into boxes of one size; those at the ends may be smaller."""
 
-    def __init__(self, path: Path, study: Study):
-        """Use `open_store`."""
+    shape: tuple[int, ...]  # of the outer axes, then the trials
+    box: tuple[int, ...]
+
+    @staticmethod
+    def from_shape(shape: Sequence[int], most: int) -> "BoxLayout":
+        """Cut boxes of at most `most` trials: first one cell's, then its neighbours'."""
+        room, box = max(most, 1), []
+        for length in reversed(shape):
+            box.append(min(length, max(room, 1)))
+            room //= box[-1]
+        return BoxLayout(tuple(shape), tuple(reversed(box)))
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """The number of boxes along each axis."""
+        return tuple(-(-n // b) for n, b in zip(self.shape, self.box, strict=True))
+
+    @property
+    def trials(self) -> int:
+        """The number of trials in all cells."""
+        return math.prod(self.shape)
+
+    def region(self, index: Sequence[int]) -> tuple[slice, ...]:
+        """The slices of the box at an index."""
+        return tuple(
+            slice(i * b, min((i + 1) * b, n))
+            for i, b, n in zip(index, self.box, self.shape, strict=True)
+        )
+
+    def size(self, index: Sequence[int]) -> int:
+        """The number of trials in the box at an index."""
+        return math.prod(part.stop - part.start for part in self.region(index))
+
+    def cells(self, index: Sequence[int]) -> Iterator[tuple[int, ...]]:
+        """The cells of the box at an index, the last axis fastest."""
+        return itertools.product(*(range(s.start, s.stop) for s in self.region(index)[:-1]))
+
+
+class StudyStore:
+    """The store of a study.
+
+    Attributes:
+        config, versions: of the study that wrote it, as plain data.
+        layout: how its grid is cut into boxes.
+    """
+
+    def __init__(self, path: Path, mode: Any = "r"):
+        """Open a store that exists, for reading unless `mode` is "r+"; see also `open_store`.
+
+        Raises:
+            BadInput: it is not a store of a study, or damaged.
+        """
         self.path = path
-        self.study = study
-        self._group = _open_group(path, "r+")
+        group = _open_group(path, mode)
+        self.config, self.versions = (_mapping(path, group, key) for key in ("config", "versions"))
         with reading(path):
-            self._arrays: dict[str, Any] = dict(self._group.arrays())
-        self.layout = read_layout(path)
-        check_layout(path, self.layout, study.grid)
-        for name in study.schema.variables:
-            if name not in self._arrays:
-                raise BadInput(f"{path}: {name}", "missing")
+            self._arrays: dict[str, Any] = dict(group.arrays())
+            self._done = self._arrays[_DONE]
+            self.layout = _declared_layout(path, dict(self._done.attrs), self._done.shape)
 
     def missing(self) -> Iterator[Box]:
         """The boxes that are not done, in order.
@@ -66,9 +117,34 @@ class StudyStore:
             BadInput: the record of finished boxes is damaged.
         """
         with reading(self.path):
-            done = np.asarray(self._arrays[_DONE][...])
+            done = np.asarray(self._done[...])
         for index in np.argwhere(done != 1):
             yield tuple(int(i) for i in index)
+
+    def count_done(self) -> int:
+        """The number of finished trials, over all cells.
+
+        Raises:
+            BadInput: the record of finished boxes is damaged.
+        """
+        return self.layout.trials - sum(self.layout.size(box) for box in self.missing())
+
+    def dataset(self, config: Config | None = None) -> xr.Dataset:
+        """All trials as a lazy dataset: values are loaded on access.
+
+        Args:
+            config: axes, variables and layout must be those of this study.
+
+        Raises:
+            BadInput: the store is damaged, or an axis or a variable, which it names, does not fit.
+        """
+        with reading(self.path):
+            trials = xr.open_zarr(
+                self.path, chunks=None, consolidated=False, mask_and_scale=False
+            ).drop_vars(_DONE)
+            if config is not None:
+                _check(self.path, self.layout, trials, config)
+        return trials
 
     def write(
         self, box: Box, results: Mapping[str, Shaped[np.ndarray, "cells ... trials"]]
@@ -78,16 +154,13 @@ class StudyStore:
         Raises:
             BadInput: the disk is full, or the store can't be written to.
         """
-        region = self.layout.region(box)
-        lengths = [part.stop - part.start for part in region]
+        *outer, trials = self.layout.region(box)
+        lengths = [part.stop - part.start for part in outer]
         try:
-            for name in self.study.schema.variables:
-                values = results[name]
-                inner = values.shape[1:-1]
-                shaped = values.reshape(*lengths[:-1], *inner, lengths[-1])
-                everything = [slice(None)] * len(inner)
-                self._arrays[name][(*region[:-1], *everything, region[-1])] = shaped
-            self._arrays[_DONE][box] = 1
+            for name, values in results.items():
+                shaped = values.reshape(*lengths, *values.shape[1:])
+                self._arrays[name][(*outer, ..., trials)] = shaped
+            self._done[box] = 1
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise BadInput(
@@ -103,17 +176,17 @@ def open_store(path: Path, study: Study, box_trials: int | None = None) -> Study
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         _create(path, study, box_trials or study.box_trials)
-    attributes = read_attributes(path)
-    wanted = {"config": study.config.to_dict(), "versions": versions()}
+    store = StudyStore(path, "r+")
     differing = [
-        line for key in ("config", "versions") for line in difference(wanted[key], attributes[key])
+        *_difference(study.config.to_dict(), store.config),
+        *_difference(versions(), store.versions),
     ]
     if differing:
         raise BadInput(
-            path,
-            f"holds another study and is not mixed with this one: {'; '.join(differing)}",
+            path, f"holds another study and is not mixed with this one: {'; '.join(differing)}"
         )
-    return StudyStore(path, study)
+    store.dataset(study.config)
+    return store
 
 
 def sweep_unfinished(path: Path) -> None:
@@ -125,58 +198,38 @@ def sweep_unfinished(path: Path) -> None:
         shutil.rmtree(left, ignore_errors=True)
 
 
-def read_attributes(path: Path) -> dict[str, Any]:
-    """The config and versions of a store.
+def check_sizes(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Check that no part of a store that is read at once is too large, as its arrays declare.
+
+    Such a part is one chunk of any array, and the whole of an axis and of `done`.
 
     Raises:
-        BadInput: it is not a store of a study.
+        BadInput: a part is too large.
     """
-    attributes: dict[str, Any] = dict(_open_group(path, "r").attrs)
-    entries = {}
-    for key in ("config", "versions"):
-        try:
-            entries[key] = json.loads(attributes[key])
-        except (KeyError, TypeError, ValueError, RecursionError):
-            raise BadInput(path, "is not a store of jaxnav study") from None
-        if not isinstance(entries[key], dict):
-            raise BadInput(f"{path}: {key}", "must be a mapping")
-    return entries
+    for name, array in arrays.items():
+        is_whole = name == _DONE or tuple(array.metadata.dimension_names or ()) == (name,)
+        count = math.prod(array.shape if is_whole else array.chunks)
+        count = max(count, math.prod(array.chunks))
+        if array.shards is not None or count * array.dtype.itemsize > limits.STORE_BYTES:
+            raise BadInput(f"{path}: {name}", f"is too large: {array.shape} by {array.chunks}")
 
 
-def read_dataset(path: Path) -> xr.Dataset:
-    """All trials of a store as a lazy dataset: values are loaded on access.
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn any error of a block that reads a store into `BadInput`.
 
     Raises:
-        BadInput: it is not a store of a study.
+        BadInput: the data read are damaged.
     """
-    read_attributes(path)
-    with reading(path):
-        whole = xr.open_zarr(path, chunks=None, consolidated=False, mask_and_scale=False)
-        return whole.drop_vars(_DONE)
-
-
-def read_layout(path: Path) -> BoxLayout:
-    """The layout of a store.
-
-    Raises:
-        BadInput: it is not a store of a study.
-    """
-    with reading(path):
-        done: Any = _open_group(path, "r")[_DONE]
-        return layout_of(path, dict(done.attrs), done.shape)
-
-
-def count_done(path: Path) -> int:
-    """The number of finished trials in a store, over all cells.
-
-    Raises:
-        BadInput: it is not a store of a study.
-    """
-    layout = read_layout(path)
-    with reading(path):
-        done: Any = _open_group(path, "r")[_DONE]
-        boxes = np.argwhere(done[...] == 1).tolist()
-    return sum(layout.size(box) for box in boxes)
+    try:
+        yield
+    except BadInput:
+        raise
+    except Exception as error:
+        # Zarr, its codecs and xarray may raise anything on the bytes they find.
+        said = f"{type(error).__name__}: {error}"
+        shown = said if len(said) <= _LONGEST else f"{said[:_LONGEST]}..."
+        raise BadInput(path, f"is damaged ({shown})") from None
 
 
 def _open_group(path: Path, mode: Any) -> zarr.Group:
@@ -200,39 +253,103 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
     return group
 
 
-def _create(path: Path, study: Study, most: int) -> None:
+def _mapping(path: Path, group: zarr.Group, key: str) -> dict[str, Any]:
+    try:
+        value = json.loads(dict(group.attrs)[key])
+    except (KeyError, TypeError, ValueError, RecursionError):
+        raise BadInput(path, "is not a store of jaxnav study") from None
+    if not isinstance(value, dict):
+        raise BadInput(f"{path}: {key}", "must be a mapping")
+    return value
+
+
+def _declared_layout(
+    path: Path, attributes: Mapping[str, Any], counts: tuple[int, ...]
+) -> BoxLayout:
+    """The layout by the attributes of `done`, whose shape is `counts`."""
+    sizes: dict[str, tuple[int, ...]] = {}
+    for key in ("shape", "box"):
+        given = attributes.get(key)
+        are_sizes = isinstance(given, list) and all(type(n) is int and n > 0 for n in given)
+        if not isinstance(given, list) or not are_sizes or len(given) != len(counts):
+            problem = f"must be {len(counts)} whole numbers above 0, got {given!r}"
+            raise BadInput(f"{path}: done.{key}", problem)
+        sizes[key] = tuple(given)
+    layout = BoxLayout(**sizes)
+    if layout.counts != counts:
+        problem = f"does not fit its attributes, which make {layout.counts}: it has {counts}"
+        raise BadInput(f"{path}: done", problem)
+    return layout
+
+
+def _check(path: Path, layout: BoxLayout, trials: xr.Dataset, config: Config) -> None:
+    """Check a store's layout, axes and variables, not yet their numbers, against a config."""
+    if layout.shape != config.shape:
+        problem = f"must be {list(config.shape)}, as the config says, got {list(layout.shape)}"
+        raise BadInput(f"{path}: done.shape", problem)
+    for name, values in config.axes.items():
+        if name not in trials.coords or trials.coords[name].values.tolist() != list(values):
+            raise BadInput(f"{path}: {name}", "is not the axis that the config says")
+    for name, variable in config.schema.variables.items():
+        if name not in trials:
+            raise BadInput(f"{path}: {name}", "missing")
+        wanted = config.sizes(variable), np.dtype(variable.dtype)
+        form = dict(trials[name].sizes), trials[name].dtype
+        if form != wanted or [*form[0]] != [*wanted[0]]:
+            raise BadInput(f"{path}: {name}", f"must be {wanted}, got {form}")
+
+
+def _create(path: Path, study: Study, box_trials: int) -> None:
     """Create a new store, whole or not at all."""
-    config = study.config
-    axes = study.grid.outer_axes
-    layout = BoxLayout.of([*map(len, axes.values()), config.trials], most)
+    config, schema = study.config, study.schema
+    layout = BoxLayout.from_shape(config.shape, box_trials)
+    boxes = dict(zip((*config.outer_axes, "trial"), layout.box, strict=True))
     beside = path.with_name(_unfinished(path) + secrets.token_hex(4))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            group = zarr.create_group(
-                beside,
-                attributes={
-                    "title": f"jaxnav study {study.schema.kind}",
-                    "config": json.dumps(config.to_dict()),
-                    "versions": json.dumps(versions()),
-                },
-            )
+            about = {"config": json.dumps(config.to_dict()), "versions": json.dumps(versions())}
+            title = f"jaxnav study {schema.kind}"
+            group = zarr.create_group(beside, attributes={"title": title, **about})
             for name, values in config.axes.items():
-                parameter = study.schema.parameters[name]
-                array = np.asarray(values) if not parameter.choices else np.asarray(values, object)
-                _coordinate(group, name, array, parameter.unit, parameter.description)
-            for name, variable in study.schema.variables.items():
-                _empty(group, name, variable, study, layout)
-            done = group.create_array(
+                parameter = schema.parameters[name]
+                coordinate = np.asarray(values, object if parameter.choices else None)
+                dtype: Any = "string" if parameter.choices else coordinate.dtype
+                group.create_array(
+                    name,
+                    shape=coordinate.shape,
+                    chunks=coordinate.shape,
+                    dtype=dtype,
+                    dimension_names=[name],
+                    compressors=_CHECKED,
+                    attributes=_described(parameter.unit, parameter.description),
+                )[...] = coordinate
+            for name, variable in schema.variables.items():
+                sizes, kind = config.sizes(variable), np.dtype(variable.dtype)
+                attributes = _described(variable.unit, variable.description)
+                if variable.outcomes:
+                    attributes["flag_values"] = list(range(len(variable.outcomes)))
+                    attributes["flag_meanings"] = " ".join(variable.outcomes)
+                group.create_array(
+                    name,
+                    shape=tuple(sizes.values()),
+                    chunks=tuple(boxes.get(name, length) for name, length in sizes.items()),
+                    dtype=kind,
+                    fill_value=math.nan if kind.kind == "f" else np.iinfo(kind).max,
+                    dimension_names=list(sizes),
+                    compressors=_COMPRESSED,
+                    attributes=attributes,
+                )
+            group.create_array(
                 _DONE,
                 shape=layout.counts,
                 chunks=(1,) * len(layout.counts),
                 dtype="int8",
                 fill_value=0,
-                dimension_names=[f"{name}_box" for name in (*axes, "trial")],
+                dimension_names=[f"{name}_box" for name in boxes],
                 compressors=_CHECKED,
+                attributes={"shape": list(layout.shape), "box": list(layout.box)},
             )
-            done.attrs.update({"shape": list(layout.shape), "box": list(layout.box)})
             if path.exists():
                 path.rmdir()
             beside.rename(path)
@@ -243,53 +360,34 @@ def _create(path: Path, study: Study, most: int) -> None:
         raise BadInput(path, f"can't be made: {reason}") from None
 
 
+def _described(unit: str, description: str) -> dict[str, Any]:
+    return {"units": unit or "1", "long_name": description}
+
+
 def _unfinished(path: Path) -> str:
     """The prefix of the name of a store that is being created."""
     return f".jaxnav-{path.name}-"
 
 
-def _coordinate(
-    group: zarr.Group, name: str, values: np.ndarray, unit: str, description: str
-) -> None:
-    dtype: Any = "string" if values.dtype == object else values.dtype
-    array = group.create_array(
-        name,
-        shape=values.shape,
-        chunks=values.shape,
-        dtype=dtype,
-        dimension_names=[name],
-        compressors=_CHECKED,
-    )
-    array[...] = values
-    array.attrs.update({"units": unit or "1", "long_name": description})
-
-
-def _empty(
-    group: zarr.Group, name: str, variable: Variable, study: Study, layout: BoxLayout
-) -> None:
-    dimensions = study.grid.dimensions(variable)
-    places = dict(zip((*study.grid.outer_axes, "trial"), range(len(layout.shape)), strict=True))
-    shape, box = [], []
-    for dimension in dimensions:
-        if dimension in places:
-            shape.append(layout.shape[places[dimension]])
-            box.append(layout.box[places[dimension]])
+def _difference(wanted: Mapping[str, Any], other: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """The differences between two studies, as lines `key: here, there`."""
+    differing = []
+    for key in sorted(set(wanted) | set(other)):
+        here, there = wanted.get(key), other.get(key)
+        if here == there and type(here) is type(there):
+            continue
+        name = f"{prefix}{key}"
+        if isinstance(here, Mapping) and isinstance(there, Mapping):
+            differing += _difference(here, there, f"{name}.") or [f"{name}: in another order"]
         else:
-            shape.append(len(study.config.axes[dimension]))
-            box.append(shape[-1])
-    dtype = np.dtype(variable.dtype)
-    missing = math.nan if dtype.kind == "f" else np.iinfo(dtype).max
-    array = group.create_array(
-        name,
-        shape=shape,
-        chunks=tuple(box),
-        dtype=dtype,
-        fill_value=missing,
-        dimension_names=dimensions,
-        compressors=_COMPRESSED,
-    )
-    attributes: dict[str, Any] = {"units": variable.unit or "1", "long_name": variable.description}
-    if variable.outcomes:
-        attributes["flag_values"] = list(range(len(variable.outcomes)))
-        attributes["flag_meanings"] = " ".join(variable.outcomes)
-    array.attrs.update(attributes)
+            differing.append(f"{name} is {_short(here)} here and {_short(there)} there")
+    if not differing and list(wanted.get("axes", {})) != list(other.get("axes", {})):
+        differing.append("axes are in another order")
+    return differing
+
+
+def _short(value: object) -> str:
+    if value is None:
+        return "nothing"
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -9,57 +9,64 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32, Int, Shaped
 
-from jaxnav.experiments.studies.layout import BoxLayout
-from jaxnav.experiments.studies.study import Grid, Variable
+from jaxnav.experiments.studies.store import BoxLayout
+from jaxnav.experiments.studies.study import Config, Progress, Schema, nobody
 from jaxnav.sim.statistics import wilson_interval
 
 SHARES = {"median": 0.5, "p95": 0.95}
 RELIABILITY_BINS = 20
+# (variable, trials) -> those trials of one box of cells.
+Block = Callable[[str, slice], Shaped[np.ndarray, "rows trials"]]
 Blocks = Callable[[], Iterator[Float32[np.ndarray, "cells trials"]]]  # NaN where missing
 
 
 def summarise(
-    trials: xr.Dataset,
-    grid: Grid,
-    layout: BoxLayout,
-    progress: Callable[[int], object] = lambda done: None,
+    trials: xr.Dataset, config: Config, layout: BoxLayout, progress: Progress = nobody
 ) -> xr.Dataset:
     """All measures of every cell. A cell without trials has counts of zero and no numbers.
 
     Args:
         trials: the store's dataset.
-        grid: the grid of the trials.
+        config: the study of the trials.
         layout: the layout of the store.
         progress: called with the number of trials read since the last call.
     """
-    summary = xr.Dataset(
-        coords={name: trials.coords[name] for name in grid.config.axes}, attrs=trials.attrs
-    )
-    for name, variable in grid.schema.variables.items():
-        dims = grid.dimensions(variable)[:-1]
-        for measure, (extra, unit, dtype) in _measures(name, variable).items():
-            shape = [trials.sizes[d] for d in dims] + [len(labels) for labels in extra.values()]
-            empty = np.full(shape, 0 if dtype is np.int64 else np.nan, dtype)
-            about = {"units": unit or "1", "long_name": variable.description}
-            summary[measure] = ((*dims, *extra), empty, about)
-            summary = summary.assign_coords(extra)
-    bins = _Reliability(grid, trials)
+    schema = config.schema
+    coords: dict[str, Any] = {name: trials.coords[name] for name in config.axes}
+    measures: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
+    bins = _Reliability(config)
+    first_cell = (0,) * (len(layout.shape) - 1)
+    spans = [layout.region((*first_cell, t))[-1] for t in range(layout.counts[-1])]
     for box in np.ndindex(*layout.counts[:-1]):
         region = layout.region((*box, 0))[:-1]
-        for name, variable in grid.schema.variables.items():
-            dims = grid.dimensions(variable)[:-1]
-            index = region + (slice(None),) * (len(dims) - len(region))
-            for measure, numbers in _summed(trials, grid, layout, name, index).items():
-                part = summary[measure].values[index]
-                summary[measure].values[index] = numbers.reshape(part.shape)
-        bins.add(layout, region)
+
+        def block(
+            name: str, span: slice, region: tuple[slice, ...] = region
+        ) -> Shaped[np.ndarray, "rows trials"]:
+            values = trials[name][(*region, ..., span)].values
+            return values.reshape(-1, values.shape[-1])
+
+        for name, variable in schema.variables.items():
+            *dims, _ = config.sizes(variable)
+            for measure, numbers in _summed(name, schema, block, spans).items():
+                counts = measure.endswith(("_count", "_counted"))
+                unit = "1" if counts else variable.unit or "1"
+                extra = (name,) if numbers.ndim > 1 else ()
+                shape = (*(trials.sizes[dim] for dim in dims), *numbers.shape[1:])
+                about = {"units": unit, "long_name": variable.description}
+                new = ((*dims, *extra), np.zeros(shape, numbers.dtype), about)
+                whole = measures.setdefault(measure, new)[1]
+                whole[region] = numbers.reshape(whole[region].shape)
+        bins.add(block, spans)
         progress(layout.shape[-1] * int(np.prod([s.stop - s.start for s in region])))
-    for name, rate in grid.schema.rates.items():
-        counts = summary[f"{rate.variable}_count"]
-        happened = counts.sel({rate.variable: list(rate.of)}).sum(rate.variable)
-        among = counts.sel({rate.variable: list(rate.among)}).sum(rate.variable)
+    coords |= {name: list(v.outcomes) for name, v in schema.variables.items() if v.outcomes}
+    summary = xr.Dataset(measures, coords, trials.attrs)
+    for name, rate in schema.rates.items():
+        of_outcome = summary[f"{rate.variable}_count"]
+        happened = of_outcome.sel({rate.variable: list(rate.of)}).sum(rate.variable)
+        among = of_outcome.sel({rate.variable: list(rate.among)}).sum(rate.variable)
         value = happened / among.where(among > 0)
         ends = wilson_interval(value.values, among.where(among > 0).values)
         for suffix, array in zip(("", "_low", "_high"), (value.values, *ends), strict=True):
@@ -68,62 +75,37 @@ def summarise(
     return summary.merge(bins.table())
 
 
-def _measures(name: str, variable: Variable) -> dict[str, tuple[dict[str, Any], str, Any]]:
-    """The measures of a variable: name -> further dimensions with labels, unit and dtype."""
+def _summed(name: str, schema: Schema, block: Block, spans: list[slice]) -> dict[str, np.ndarray]:
+    """The measures of one variable in the rows of one box of cells, (rows,) or (rows, outcomes)."""
+    variable = schema.variables[name]
     if variable.outcomes:
-        return {f"{name}_count": ({name: list(variable.outcomes)}, "", np.int64)}
-    measures: dict[str, tuple[dict[str, Any], str, Any]] = {
-        f"{name}_{statistic}": ({}, variable.unit, np.float64) for statistic in (*SHARES, "mean")
-    }
-    return measures | {f"{name}_counted": ({}, "", np.int64)}
-
-
-def _summed(
-    trials: xr.Dataset, grid: Grid, layout: BoxLayout, name: str, index: tuple[slice, ...]
-) -> dict[str, np.ndarray]:
-    """The measures of one variable in one box of cells."""
-    variable = grid.schema.variables[name]
-    spans = _spans(layout)
-    if variable.outcomes:
-        counts: Any = 0
-        for span in spans:
-            values = _rows(trials[name], index, span)
-            counts = counts + np.stack(
-                [np.sum(values == i, axis=1) for i in range(len(variable.outcomes))], axis=1
-            )
-        return {f"{name}_count": np.asarray(counts)}
-    whole = np.dtype(variable.dtype).kind == "i"
+        codes = np.arange(len(variable.outcomes))[:, None]
+        each = (np.sum(block(name, span)[:, None] == codes, axis=2) for span in spans)
+        return {f"{name}_count": np.sum(list(each), axis=0)}
+    outcomes = [schema.variables["outcome"].outcomes.index(o) for o in variable.among]
 
     def blocks() -> Iterator[np.ndarray]:
         for span in spans:
-            values = _rows(trials[name], index, span)
+            values = block(name, span)
+            whole = values.dtype.kind == "i"
             missing = values == np.iinfo(values.dtype).max if whole else ~np.isfinite(values)
-            if variable.among:
-                outcome = _rows(trials["outcome"], index, span)
-                wanted = [
-                    grid.schema.variables["outcome"].outcomes.index(o) for o in variable.among
-                ]
-                missing = missing | ~np.isin(outcome, wanted)
+            if outcomes:
+                missing = missing | ~np.isin(block("outcome", span), outcomes)
             yield np.where(missing, np.nan, values).astype(np.float32)
 
     counted: Any = 0
     total: Any = 0.0
-    for block in blocks():
-        counted = counted + np.sum(np.isfinite(block), axis=1)
-        total = total + np.nansum(block, axis=1, dtype=np.float64)
-    measures = {f"{name}_counted": np.asarray(counted)}
-    measures[f"{name}_mean"] = np.where(counted, total / np.maximum(counted, 1), np.nan)
-    for statistic, share in SHARES.items():
-        measures[f"{name}_{statistic}"] = order_statistic(
-            blocks, share, np.asarray(counted), len(spans)
-        )
-    return measures
-
-
-def _rows(array: xr.DataArray, index: tuple[slice, ...], span: slice) -> np.ndarray:
-    """The values of some trials of a box of cells, (cells, trials)."""
-    values = array[(*index, span)].values
-    return values.reshape(-1, values.shape[-1])
+    for values in blocks():
+        counted = counted + np.sum(np.isfinite(values), axis=1)
+        total = total + np.nansum(values, axis=1, dtype=np.float64)
+    return {
+        **{
+            f"{name}_{statistic}": order_statistic(blocks, share, np.asarray(counted), len(spans))
+            for statistic, share in SHARES.items()
+        },
+        f"{name}_mean": np.where(counted, total / np.maximum(counted, 1), np.nan),
+        f"{name}_counted": np.asarray(counted),
+    }
 
 
 def order_statistic(
@@ -144,7 +126,7 @@ def order_statistic(
     if passes == 1:
         ordered = np.sort(next(blocks()), axis=1)  # NaN last
         value = np.take_along_axis(ordered, rank[:, None], axis=1)[:, 0]
-        return np.where(counted > 0, value, np.nan)
+        return np.where(counted > 0, value, np.nan).astype(float)
     upper = np.zeros((len(rank), 2**16), np.int64)
     for block in blocks():
         for row, values in enumerate(block):
@@ -160,7 +142,7 @@ def order_statistic(
     bits = (bucket.astype(np.uint32) << 16) | last.astype(np.uint32)
     positive = bits >> 31 == 1
     value = np.where(positive, bits & 0x7FFFFFFF, ~bits).astype(np.uint32).view(np.float32)
-    return np.where(counted > 0, value, np.nan)
+    return np.where(counted > 0, value, np.nan).astype(float)
 
 
 def _ordered_bits(values: np.ndarray) -> np.ndarray:
@@ -172,30 +154,26 @@ def _ordered_bits(values: np.ndarray) -> np.ndarray:
 class _Reliability:
     """The predicted probabilities and observed frequencies, over all cells, per selector."""
 
-    def __init__(self, grid: Grid, trials: xr.Dataset):
-        self._schema, self._trials = grid.schema, trials
-        self._by_selector = "selector" in grid.schema.inner and "selector" in grid.config.axes
-        selectors = len(grid.config.axes["selector"]) if self._by_selector else 1
+    def __init__(self, config: Config):
+        self._schema = config.schema
+        self._by_selector = "selector" in config.schema.inner and "selector" in config.axes
+        selectors = len(config.axes["selector"]) if self._by_selector else 1
         self._sums = np.zeros((3, selectors, RELIABILITY_BINS))  # count, predicted, happened
 
-    def add(self, layout: BoxLayout, region: tuple[slice, ...]) -> None:
+    def add(self, block: Block, spans: list[slice]) -> None:
         """Add one box of cells."""
         if self._schema.predicted is None:
             return
         rate, selectors = self._schema.rates["flip_rate"], self._sums.shape[1]
         codes = self._schema.variables[rate.variable].outcomes
-        index = region + (slice(None),) * self._by_selector
-        for span in _spans(layout):
-            predicted, outcome = (
-                self._trials[name][(*index, span)].values.reshape(-1, selectors, _length(span))
-                for name in (self._schema.predicted, rate.variable)
-            )
-            counted = np.isin(outcome, [codes.index(o) for o in rate.among]) & np.isfinite(
-                predicted
-            )
+        for span in spans:
+            predicted, outcome = block(self._schema.predicted, span), block(rate.variable, span)
+            counted = np.isin(outcome, [codes.index(o) for o in rate.among])
+            counted &= np.isfinite(predicted)
             happened = np.isin(outcome, [codes.index(o) for o in rate.of])
-            for s in range(selectors):
-                p, h = predicted[:, s][counted[:, s]], happened[:, s][counted[:, s]]
+            for s in range(selectors):  # the fastest axis of the rows
+                some = counted[s::selectors]
+                p, h = predicted[s::selectors][some], happened[s::selectors][some]
                 bins = np.clip((p * RELIABILITY_BINS).astype(int), 0, RELIABILITY_BINS - 1)
                 for row, weights in enumerate((np.ones_like(p), p, h)):
                     self._sums[row, s] += np.bincount(bins, weights, RELIABILITY_BINS)
@@ -216,13 +194,3 @@ class _Reliability:
             "high": high,
         }
         return xr.Dataset({f"reliability_{n}": (dims, values) for n, values in columns.items()})
-
-
-def _spans(layout: BoxLayout) -> list[slice]:
-    """The trials, as slices, of every box of a cell."""
-    first_cell = (0,) * (len(layout.shape) - 1)
-    return [layout.region((*first_cell, t))[-1] for t in range(layout.counts[-1])]
-
-
-def _length(span: slice) -> int:
-    return int(span.stop - span.start)

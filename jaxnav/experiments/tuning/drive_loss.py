@@ -143,7 +143,7 @@ def _fractions(
         limits = vehicle.limits
     else:
         limits = jnp.stack([vehicle.steering_limit_rad, vehicle.throttle_limit])
-    # What can't move to its left is never told to.
+    # What can't move to its left is never commanded to.
     return commands / jnp.where(limits > 0, limits, 1)[:, None]
 
 

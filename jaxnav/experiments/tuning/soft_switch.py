@@ -105,8 +105,7 @@ def soften_switch(navigator: Navigator, softness_m: float | Float[Array, ""]) ->
     if navigator.controller is None:
         raise ValueError("a navigator without waypoints has no drive to be tuned")
     soft = SoftController(
-        navigator.controller,
-        jnp.asarray(softness_m, navigator.controller.waypoint_radius_m.dtype),
+        navigator.controller, jnp.asarray(softness_m, navigator.controller.waypoint_radius_m.dtype)
     )
     return cast(Navigator, eqx.tree_at(lambda n: n.controller, navigator, soft))
 

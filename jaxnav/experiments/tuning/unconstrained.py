@@ -1,6 +1,6 @@
 """Map a navigator's parameters to unconstrained numbers, which an optimiser moves.
 
-    space = Space.of(navigator, trainable={"motion.odometry_sigma": True, ...})
+    space = Space.from_navigator(navigator, trainable={"motion.odometry_sigma": True, ...})
     navigator = with_parameters(navigator, space.values(x))    # at any vector x, as space.start is
 
 A positive scalar is a softplus, in units of its typical value. A covariance is log-Cholesky: L with
@@ -37,7 +37,7 @@ class Space(eqx.Module):
     full: frozenset[str] = eqx.field(static=True)  # those that are whole matrices
 
     @staticmethod
-    def of(
+    def from_navigator(
         navigator: Navigator, trainable: Mapping[str, bool], full: frozenset[str] = frozenset()
     ) -> "Space":
         """The space that starts at a navigator's own parameters.

@@ -10,13 +10,13 @@ Rerun comes with the extra `viz` and is imported when a view is opened.
 
 import importlib
 import os
+import queue
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -47,6 +47,10 @@ class RerunView:
     While a car drives, no caller waits: a thread of its own draws from a queue, and items that do
     not fit are dropped and counted. It then shows ten outcomes with corners, ten without, and ten
     frames of each camera in a second, and a new health at once.
+
+    Attributes:
+        dropped: number of outcomes and images dropped so far.
+        failed: the reason why nothing is shown any more, or None.
     """
 
     def __init__(
@@ -85,26 +89,15 @@ class RerunView:
         self._stream.set_sinks(*sinks)
         self._scene = RerunScene(rerun, self._stream, rig, markers, waypoints_m)
         self._waits = waits
-        self._queue: deque[Callable[[RerunScene], None]] = deque()
-        self._queue_items = queue_items
-        self._lock = threading.RLock()
+        self._queue: queue.Queue[Callable[[RerunScene], None]] = queue.Queue(queue_items)
         self._closing = threading.Event()
-        self._dropped = 0
-        self._failed: str | None = None
+        self._lock = threading.Lock()  # for the count
+        self.dropped = 0
+        self.failed: str | None = None
         self._shown_ns: dict[object, int] = {}
         self._thread = threading.Thread(target=self._run, name="jaxnav-viewer", daemon=True)
         if not waits:
             self._thread.start()
-
-    @property
-    def dropped(self) -> int:
-        """The number of outcomes and images dropped so far."""
-        return self._dropped
-
-    @property
-    def failed(self) -> str | None:
-        """The reason why nothing is shown any more, or None."""
-        return self._failed
 
     def show(self, outcome: Outcome) -> None:
         """Show the pilot's outcome of an event. Never raises."""
@@ -154,36 +147,38 @@ class RerunView:
         return True
 
     def _offer(self, draw: Callable[[RerunScene], None]) -> None:
+        if self._closing.is_set() or self.failed is not None:
+            self._drop()
+        elif self._waits:
+            self._draw(draw)
+        else:
+            try:
+                self._queue.put_nowait(draw)
+            except queue.Full:
+                self._drop()
+
+    def _drop(self) -> None:
         with self._lock:
-            gone = self._closing.is_set() or self._failed is not None
-            if gone or len(self._queue) >= self._queue_items:
-                self._dropped += 1
-                return
-            if not self._waits:
-                self._queue.append(draw)
-                return
-        self._draw(draw)
+            self.dropped += 1
 
     def _run(self) -> None:
-        while True:
-            if self._queue:
-                self._draw(self._queue.popleft())
+        while not (self._closing.is_set() and self._queue.empty()):
+            with suppress(queue.Empty):
+                self._draw(self._queue.get(timeout=_IDLE_S))
                 time.sleep(0)  # the driving thread may have the interpreter first
-            elif self._closing.wait(_IDLE_S) and not self._queue:
-                break
             if self._viewer is not None and self._viewer.poll() is not None:
-                with self._lock:
-                    self._failed = "the viewer was closed"
-                    self._dropped += len(self._queue)
-                    self._queue.clear()
-                break
+                self.failed = "the viewer was closed"
+                with suppress(queue.Empty):
+                    while True:
+                        self._queue.get_nowait()
+                        self._drop()
+                return
 
     def _draw(self, draw: Callable[[RerunScene], None]) -> None:
         try:
             draw(self._scene)
         except Exception:  # whatever fails in drawing, the vehicle drives on
-            with self._lock:
-                self._dropped += 1
+            self._drop()
 
 
 def import_rerun() -> ModuleType:

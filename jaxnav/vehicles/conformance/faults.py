@@ -38,6 +38,7 @@ ALL_CAMERAS = range(4)  # of the trial's rig
 SETTLE_S = 2.0  # this long after a fault the position must be right again
 # Whoever is farther off than this, and drives on at health OK, lies: a stranger's hand or shin.
 LIE_M = 0.5
+WAYS = ("lied_m", "named_m", "slow_m", "stood_m")
 WAYPOINTS_M = (
     (1.3, 0.0), (0.3, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5),
     (0.5, 0.2), (-0.8, -0.2), (-1.2, -1.0), (-0.3, -1.5), (0.8, -1.2), (1.5, -0.5), (0.5, 0.2),
@@ -69,7 +70,7 @@ class FaultRow:
         shift_m: offset of the files' coordinates of map and route from the trial's world.
         bases: the vehicles on which it is tried, see `Trial.base`.
         gyro: tried only on vehicles that have one.
-        lied_m, named_m, slow_m, stood_m: the most that the `Ways` of the drive may be.
+        lied_m, named_m, slow_m, stood_m: the most that the ways of the drive may be, see `Result`.
     """
 
     name: str
@@ -105,24 +106,18 @@ class FaultRow:
 
 
 @dataclass(frozen=True)
-class Ways:
-    """How far the vehicle has truly driven, m, with the way of its rim where it turns.
+class Result:
+    """The result of a drive with a fault.
 
     Attributes:
-        lied_m: at health OK while its pose is more than LIE_M off.
-        named_m, slow_m, stood_m: from the fault's begin until one of the row's faults is told,
-            until health is DEGRADED or worse, and until it stands in the end; inf: never.
+        faults, rejects, worst, error_m, error_after_m: see `FaultRow`.
+        recovered_s: from the fault's end to lasting health; inf: never, or the fault lasts.
+        ways_m: how far the vehicle has truly driven, m, with the way of its rim where it turns:
+            `lied_m` at health OK while its pose is more than LIE_M off; `named_m`, `slow_m`,
+            `stood_m` from the fault's begin until one of the row's faults is reported, until
+            health is DEGRADED or worse, and until it stands in the end; inf: never.
+        broken: promises that were not kept.
     """
-
-    lied_m: float
-    named_m: float
-    slow_m: float
-    stood_m: float
-
-
-@dataclass(frozen=True)
-class Result:
-    """The result of a drive with a fault."""
 
     row: FaultRow
     faults: Fault
@@ -130,10 +125,10 @@ class Result:
     worst: Health
     error_m: float
     error_after_m: float
-    recovered_s: float  # from the fault's end to lasting health; inf: never, or the fault lasts
+    recovered_s: float
     restarts: int
-    ways: Ways
-    broken: tuple[str, ...]  # promises that were not kept
+    ways_m: dict[str, float]
+    broken: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -172,13 +167,7 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     leave_m = route.leaves_at_m
     pilot = Pilot(navigator, program=program, relocate=row.relocate, leave_m=leave_m)
     world = SimWorld(
-        trial.rig,
-        markers,
-        trial.vehicle,
-        route.start_pose,
-        BEGIN_NS,
-        trial.settings,
-        trial.seed,
+        trial.rig, markers, trial.vehicle, route.start_pose, BEGIN_NS, trial.settings, trial.seed
     )
     delays = None
     if Fault.CAMERA_LATE in row.faults and isinstance(trial.vehicle, Vehicle):
@@ -217,54 +206,51 @@ def judge(row: FaultRow, steps: list[Step], pilot: Pilot) -> Result:
     after = np.flatnonzero(times_s >= row.ends_s)
     ill = after[(healths[after] < Health.OK) | (healths[after] > row.well)]
     well = after[after > ill.max(initial=-1)]  # all that follow the last ill one
-    recovered_s = float(times_s[well[0]] - row.ends_s) if len(well) else math.inf
     controller = pilot.navigator.controller
     assert controller is not None  # a pilot has one
     result = Result(
         row,
         faults,
         rejects,
-        Health(int(healths[shaken].max(initial=0))),
-        float(np.nanmax(errors_m[shaken], initial=0.0)),
-        float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
-        recovered_s,
-        outcomes[-1].restarts,
-        ways_of(row, steps, chassis_of(controller.vehicle).lever_m),
-        (),
+        worst=Health(int(healths[shaken].max(initial=0))),
+        error_m=float(np.nanmax(errors_m[shaken], initial=0.0)),
+        error_after_m=float(np.nanmax(errors_m[times_s >= row.ends_s + SETTLE_S], initial=0.0)),
+        recovered_s=float(times_s[well[0]] - row.ends_s) if len(well) else math.inf,
+        restarts=outcomes[-1].restarts,
+        ways_m=_ways_m(row, steps, chassis_of(controller.vehicle).lever_m),
     )
     return dataclasses.replace(result, broken=tuple(_broken(result, steps, pilot)))
 
 
-def ways_of(row: FaultRow, steps: list[Step], lever_m: float) -> Ways:
-    """Measure how far a drive went on a lie.
+def _ways_m(row: FaultRow, steps: list[Step], lever_m: float) -> dict[str, float]:
+    """How far a drive went on a lie; see `Result`.
 
     Args:
         lever_m: way of the rim by a turn of 1 rad, see `Chassis`.
     """
-    lied_m = way_m = 0.0
-    reached: dict[str, float] = {}
+    ways_m = dict.fromkeys(WAYS, math.inf) | {"lied_m": 0.0}
+    way_m = 0.0
     for before, step in pairwise(steps):
         moved = step.truth[:3] - before.truth[:3]
         gone_m = float(np.hypot(*moved[:2])) + lever_m * abs(float(moved[2]))
         outcome = before.outcome
         off_m = np.hypot(*(outcome.pose - planar_in_world(before.truth[:3], outcome.origin_m))[:2])
         if outcome.health == Health.OK and off_m > LIE_M:
-            lied_m += gone_m
+            ways_m["lied_m"] += gone_m
         if (step.input.now_ns - BEGIN_NS) / 1e9 < row.begins_s:
             continue
         way_m += gone_m
         if step.outcome.faults & row.faults:
-            reached.setdefault("named_m", way_m)
+            ways_m["named_m"] = min(ways_m["named_m"], way_m)
         if step.outcome.health >= Health.DEGRADED:
-            reached.setdefault("slow_m", way_m)
+            ways_m["slow_m"] = min(ways_m["slow_m"], way_m)
     if _stands(steps[-1].outcome):
-        reached["stood_m"] = way_m
-    told = (reached.get(name, math.inf) for name in ("named_m", "slow_m", "stood_m"))
-    return Ways(lied_m, *told)
+        ways_m["stood_m"] = way_m
+    return ways_m
 
 
 def _stands(outcome: Outcome) -> bool:
-    """Whether it is told to stand."""
+    """Whether the command is to stand."""
     return outcome.throttle == 0 and not any(outcome.twist or ())
 
 
@@ -291,7 +277,7 @@ def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
         said.append(f"error afterwards {result.error_after_m:.3f} m")
     if math.isfinite(row.ends_s) and result.recovered_s > SETTLE_S:
         said.append(f"recovered after {result.recovered_s:.1f} s")
-    for name, way_m in dataclasses.asdict(result.ways).items():
+    for name, way_m in result.ways_m.items():
         if way_m > getattr(row, name):
             said.append(f"{name} {way_m:.2f}")
     limits = pilot.limits
@@ -319,10 +305,7 @@ def line(result: Result) -> str:
     seen = ", ".join([*names(result.faults), *names(result.rejects)]).lower() or "-"
     recovered = "-" if math.isinf(result.recovered_s) else f"{result.recovered_s:.2f}"
     kept = "; ".join(result.broken) or "yes"
-    ways = [
-        "-" if math.isinf(way_m) else f"{way_m:.2f}"
-        for way_m in dataclasses.asdict(result.ways).values()
-    ]
+    ways = ["-" if math.isinf(way_m) else f"{way_m:.2f}" for way_m in result.ways_m.values()]
     return (
         f"| {result.row.name} | {seen} | {result.worst.name} | {result.error_m:.3f} | "
         f"{result.error_after_m:.3f} | {recovered} | {result.restarts} | {' | '.join(ways)} | "

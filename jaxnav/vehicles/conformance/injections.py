@@ -54,33 +54,24 @@ def odometry(edit: EditOdometry) -> Change:
     return change
 
 
+def field(name: str, edit: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Edit one field of a frame, a reading or detections."""
+    return lambda whole: dataclasses.replace(whole, **{name: edit(getattr(whole, name))})
+
+
 def detections(edit: Callable[[Detections], Detections]) -> EditFrame:
     """Edit the detections of frames."""
-
-    def edited(frame: FrameDetections) -> FrameDetections:
-        seen = frame.detections
-        return frame if seen is None else dataclasses.replace(frame, detections=edit(seen))
-
-    return edited
+    return field("detections", lambda seen: None if seen is None else edit(seen))
 
 
-def corners(
-    edit: Callable[[Float[np.ndarray, "N 4 2"]], Float[np.ndarray, "N 4 2"]],
-) -> EditFrame:
+def corners(edit: Callable[[Float[np.ndarray, "N 4 2"]], Float[np.ndarray, "N 4 2"]]) -> EditFrame:
     """Edit the corners (N, 4, 2) of frames."""
-    return detections(
-        lambda sightings: dataclasses.replace(sightings, corners_px=edit(sightings.corners_px))
-    )
+    return detections(field("corners_px", edit))
 
 
 def stamps(edit: Callable[[int], int]) -> EditFrame:
     """Edit the stamps of frames."""
-    return lambda frame: dataclasses.replace(frame, stamp_ns=edit(frame.stamp_ns))
-
-
-def renamed(frame: FrameDetections) -> FrameDetections | None:
-    """Give the markers other ids."""
-    return detections(lambda seen: dataclasses.replace(seen, ids=seen.ids + 7))(frame)
+    return field("stamp_ns", edit)
 
 
 def doubled(shift_px: float) -> EditFrame:
@@ -172,7 +163,7 @@ def speed(edit: Callable[[float], float]) -> EditOdometry:
 
     def edited(reading: Reading) -> Reading:
         if isinstance(reading, Odometry):
-            return dataclasses.replace(reading, speed_mps=edit(reading.speed_mps))
+            return field("speed_mps", edit)(reading)
         return reading_of(reading.stamp_ns, tuple(map(edit, reading.values)), reading.valid)
 
     return edited
@@ -189,10 +180,7 @@ def drifting_clocks() -> Change:
     def drifting(ns: int) -> int:
         return ns + int((ns - BEGIN_NS) * 100e-6)
 
-    def reading(read: Odometry) -> Odometry:
-        return dataclasses.replace(read, stamp_ns=drifting(read.stamp_ns))
-
-    return both(frames(stamps(drifting)), odometry(reading))
+    return both(frames(stamps(drifting)), odometry(field("stamp_ns", drifting)))
 
 
 def invalid(reading: Odometry) -> Odometry:
@@ -216,8 +204,8 @@ def gyro(edit: Callable[[float], float]) -> Change:
     """Edit the rates that a gyro reads, rad/s."""
 
     def change(given: Input) -> list[Input]:
-        told = (GyroReading(one.stamp_ns, edit(one.turn_radps)) for one in given.gyro)
-        return [dataclasses.replace(given, gyro=tuple(told))]
+        edited = (GyroReading(one.stamp_ns, edit(one.turn_radps)) for one in given.gyro)
+        return [dataclasses.replace(given, gyro=tuple(edited))]
 
     return change
 

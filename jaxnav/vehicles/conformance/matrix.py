@@ -251,14 +251,14 @@ def _wired(
     )  # fmt: skip
     later = partial(row, named_m=0.85, slow_m=0.85, stood_m=1.35)
     at_once = partial(row, named_m=1.6, slow_m=1.6, stood_m=2.1, begins_s=0.0)
-    reads = reads or (lambda read, command: acts(read))
+    odometer = reads or (lambda read, command: acts(read))
     return [
         later(
             f"{name}, true odometer", happens=_once(lambda world: world.rewire(acts)), faults=faults
         ),
         at_once(
             f"{name}, odometer as told, from the start",
-            happens=_at(_FROM_START, lambda world: world.rewire(acts, reads)),
+            happens=_at(_FROM_START, lambda world: world.rewire(acts, odometer)),
             faults=faults | Fault.RESTARTED_OFTEN,
         ),
     ]
@@ -321,7 +321,11 @@ MATRIX: tuple[FaultRow, ...] = (
     _may_slow("frozen images, new stamps", _frozen(ALL_CAMERAS, 0.0), Fault.FRAME_FROZEN),
     _may_slow("NaN in corners", _corners(lambda c: c * np.nan), Fault.CORNERS_NOT_FINITE),
     _may_slow("inf in corners", _corners(lambda c: c + np.inf), Fault.CORNERS_NOT_FINITE),
-    _may_slow("unknown id", _frames(inject.renamed), Fault.UNKNOWN_MARKER),
+    _may_slow(
+        "unknown id",
+        _frames(inject.detections(inject.field("ids", lambda ids: ids + 7))),
+        Fault.UNKNOWN_MARKER,
+    ),
     _may_slow("two markers of one id", _frames(inject.doubled(60.0)), Fault.DUPLICATE_MARKER),
     FaultRow("duplicate detection", _frames(inject.doubled(0.0))),
     _briefly("mirrored corners, 5 frames", _corners(inject.mirrored)),

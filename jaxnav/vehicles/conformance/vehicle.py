@@ -41,7 +41,7 @@ def check_vehicle(
 
     Args:
         throttle_of: returns the last throttle of a car's motor, or the largest part of the twist
-            that another base was last told; None: not known.
+            that another base was last commanded; None: not known.
 
     Raises:
         AssertionError: its message says which promise is broken.
@@ -66,10 +66,7 @@ class _Check:
     """The checks of one vehicle, which one thread reads and writes, and another stops."""
 
     def __init__(
-        self,
-        vehicle: Any,
-        limits: Limits | TwistLimits,
-        throttle_of: Callable[[Any], float] | None,
+        self, vehicle: Any, limits: Limits | TwistLimits, throttle_of: Callable[[Any], float] | None
     ):
         self._vehicle, self._limits, self._throttle_of = vehicle, limits, throttle_of
         self._kind = Odometry if isinstance(limits, Limits) else TwistOdometry
@@ -109,8 +106,8 @@ class _Check:
         assert stamps[-1] > stamps[0], f"the stamps of read() stood still for {_PATIENCE_S:g} s"
         assert any(reading.valid for reading in readings), "no reading of read() was valid"
         if isinstance(self._vehicle, HasGyro):
-            told, failure = self._driver.call("read_gyro()", self._vehicle.read_gyro)
-            for one in () if failure is not None else told:
+            turns, failure = self._driver.call("read_gyro()", self._vehicle.read_gyro)
+            for one in () if failure is not None else turns:
                 _check_gyro(one)
 
     def writes(self) -> None:

@@ -24,7 +24,7 @@ NAVIGATOR = with_parameters(
     {"corner_sigma_px": jnp.asarray(2.0), "selector.floor_m": jnp.asarray(0.004)},
 )
 NAMES = ["corner_sigma_px", "motion.odometry_sigma", "selector.floor_m"]
-SPACE = Space.of(NAVIGATOR, dict.fromkeys(NAMES, True), frozenset(NAMES[1:2]))
+SPACE = Space.from_navigator(NAVIGATOR, dict.fromkeys(NAMES, True), frozenset(NAMES[1:2]))
 SIZE = SPACE.start.size
 TARGETS = jnp.asarray(np.random.default_rng(0).normal(size=(3, SIZE)))
 KEY = {"command": "tune filter", "seeds": 3, "train": NAMES, "params": None}

@@ -229,7 +229,7 @@ def test_what_is_drawn_of_a_recording_lies_among_its_markers(away, tmp_path):
     path = tmp_path / "drive.mcap"
     record(path, away.setup.header(), [(s.input, s.outcome) for s in away.steps[:90]])
     log = read_drive(path)
-    scenery = Scenery.of(log.header)
+    scenery = Scenery.from_header(log.header)
     index = int(np.flatnonzero([len(Ts) for Ts in log.outcomes.Ts_vehicle_world])[-1])
     pose_m = log.outcomes.pose[index, :2]
     assert np.linalg.norm(scenery.markers_m[0, 0, :2] - pose_m) < 5

@@ -19,8 +19,6 @@ from hypothesis import strategies as st
 from jaxnav.cli import main
 from jaxnav.errors import BadInput
 from jaxnav.experiments.studies import store as store_module
-from jaxnav.experiments.studies.config import Config
-from jaxnav.experiments.studies.layout import BoxLayout
 from jaxnav.experiments.studies.parameters import Parameter
 from jaxnav.experiments.studies.running import (
     local_cluster,
@@ -28,10 +26,10 @@ from jaxnav.experiments.studies.running import (
     run_here,
     run_on_cluster,
 )
-from jaxnav.experiments.studies.store import count_done, open_store, read_dataset, read_layout
+from jaxnav.experiments.studies.store import BoxLayout, StudyStore, open_store
 from jaxnav.experiments.studies.study import (
     Cell,
-    Grid,
+    Config,
     Progress,
     Rate,
     Schema,
@@ -100,9 +98,17 @@ class Fake(Study):
         return found
 
 
+def stored(path: Path, study: Study | None = None) -> StudyStore:
+    """The store of a study that has been run."""
+    study = study or Fake(config())
+    store = open_store(path, study)
+    run_here(study, store)
+    return store
+
+
 def config(**changes: object) -> Config:
     data = {"trials": 20, "axes": {"a_m": [1, 2, 3], "selector": ["x", "z"], "b": [2, 5]}}
-    return Config.parse("fake", PARAMETERS, data | changes, "study.yaml")
+    return Config.parse(SCHEMA, data | changes, "study.yaml")
 
 
 @pytest.mark.parametrize(
@@ -149,16 +155,17 @@ def test_a_config_is_complete_and_reads_back() -> None:
     )
     assert some.axes == {"a_m": [0.1, 0.2, 0.3, 0.4, 0.5]}
     assert some.fixed == {"b": 2, "c_deg": "random", "selector": "x"}
-    stored = json.loads(json.dumps(some.to_dict()))
-    kind, files = stored.pop("kind"), stored.pop("files")
-    assert Config.parse(kind, PARAMETERS, stored, "store", files) == some
+    plain = json.loads(json.dumps(some.to_dict()))
+    assert plain.pop("kind") == "fake"
+    files = plain.pop("files")
+    assert Config.parse(SCHEMA, plain, "store", files) == some
     spaced = config(axes={"a_m": {"from": 0.1, "to": 10, "count": 3, "scale": "log"}})
     assert spaced.axes == {"a_m": [0.1, 1.0, 10.0]}
 
 
 @given(st.lists(st.integers(1, 6), min_size=1, max_size=4), st.integers(1, 50))
 def test_every_trial_lies_in_one_box(shape: list[int], most: int) -> None:
-    layout = BoxLayout.of(shape, most)
+    layout = BoxLayout.from_shape(shape, most)
     seen = np.zeros(shape, int)
     for box in np.ndindex(*layout.counts):
         region = layout.region(box)
@@ -171,30 +178,30 @@ def test_every_trial_lies_in_one_box(shape: list[int], most: int) -> None:
 
 
 def test_a_killed_study_goes_on_to_the_same_result_whatever_the_boxes(tmp_path: Path) -> None:
-    whole = open_store(tmp_path / "whole.zarr", Fake(config()))
-    run_here(whole)
-    parts = open_store(tmp_path / "parts.zarr", Fake(config()), 7)
+    whole = stored(tmp_path / "whole.zarr")
+    study = Fake(config())
+    parts = open_store(tmp_path / "parts.zarr", study, 7)
 
     class KilledError(Exception):
         pass
 
     def stop(done: int) -> None:
-        if count_done(parts.path) > 40:
+        if parts.count_done() > 40:
             raise KilledError
 
     with pytest.raises(KilledError):
-        run_here(parts, stop)
-    held = count_done(parts.path)
+        run_here(study, parts, stop)
+    held = parts.count_done()
     assert 40 < held < 120
-    again = open_store(parts.path, Fake(config()), 1000)  # keeps its own boxes
+    again = open_store(parts.path, study, 1000)  # keeps its own boxes
     counted: list[int] = []
-    run_here(again, counted.append)
-    assert held + sum(counted) == 120 == count_done(parts.path)
-    xr.testing.assert_identical(read_dataset(whole.path), read_dataset(parts.path))
+    run_here(study, again, counted.append)
+    assert held + sum(counted) == 120 == again.count_done()
+    xr.testing.assert_identical(whole.dataset(), parts.dataset())
 
 
 def test_the_dataset_is_labelled(tmp_path: Path) -> None:
-    run_here(open_store(tmp_path / "s.zarr", Fake(config())))
+    stored(tmp_path / "s.zarr")
     found = xr.open_zarr(tmp_path / "s.zarr", consolidated=False, chunks=None)
     assert found["error_m"].dims == ("a_m", "b", "selector", "trial")
     assert found["steps"].dims == ("a_m", "b", "trial")
@@ -242,7 +249,7 @@ def test_what_is_no_store_is_refused(tmp_path: Path) -> None:
             open_store(path, Fake(config()))
     assert (tmp_path / "full" / "letter.txt").read_text() == "dear"
     with pytest.raises(BadInput, match="doesn't exist"):
-        read_layout(tmp_path / "nowhere")
+        StudyStore(tmp_path / "nowhere")
     with pytest.raises(BadInput, match="can't be made"):
         open_store(tmp_path / "file" / "s.zarr", Fake(config()))
 
@@ -252,7 +259,8 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(
 ) -> None:
     import zarr.storage._local as local
 
-    store = open_store(tmp_path / "s.zarr", Fake(config()), 20)
+    study = Fake(config())
+    store = open_store(tmp_path / "s.zarr", study, 20)
     put, written = local._put, []
 
     def filling(path: Path, *rest: object, **more: object) -> object:
@@ -263,26 +271,25 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(
 
     monkeypatch.setattr(local, "_put", filling)
     with pytest.raises(BadInput, match=r"s.zarr: can't be written: no space left on device"):
-        run_here(store)
+        run_here(study, store)
     monkeypatch.undo()
-    assert count_done(store.path) == 40
-    assert np.sum(read_dataset(store.path)["outcome"].values != 127) >= 80
-    run_here(open_store(store.path, Fake(config())))
-    assert count_done(store.path) == 120
+    assert store.count_done() == 40
+    assert np.sum(store.dataset()["outcome"].values != 127) >= 80
+    assert stored(store.path).count_done() == 120
+
+
+Summed = tuple[xr.Dataset, xr.Dataset, Config]
 
 
 @pytest.fixture(scope="module")
-def summed(tmp_path_factory: pytest.TempPathFactory) -> tuple[xr.Dataset, xr.Dataset, Grid]:
-    path = tmp_path_factory.mktemp("summed") / "s.zarr"
+def summed(tmp_path_factory: pytest.TempPathFactory) -> Summed:
     study = Fake(config(trials=300))
-    run_here(open_store(path, study))
-    trials = read_dataset(path)
-    return trials, summarise(trials, study.grid, read_layout(path)), study.grid
+    store = stored(tmp_path_factory.mktemp("summed") / "s.zarr", study)
+    trials = store.dataset()
+    return trials, summarise(trials, study.config, store.layout), study.config
 
 
-def test_a_summary_is_that_of_the_trials(
-    summed: tuple[xr.Dataset, xr.Dataset, Grid],
-) -> None:
+def test_a_summary_is_that_of_the_trials(summed: Summed) -> None:
     trials, summary, _ = summed
     at = {"a_m": 2.0, "b": 5, "selector": "z"}
     outcome, error = trials["outcome"].sel(at).values, trials["error_m"].sel(at).values
@@ -303,11 +310,9 @@ def test_a_summary_is_that_of_the_trials(
     )
 
 
-def test_a_summary_does_not_depend_on_the_boxes(
-    summed: tuple[xr.Dataset, xr.Dataset, Grid],
-) -> None:
-    trials, summary, grid = summed
-    cut = summarise(trials, grid, BoxLayout((3, 2, 300), (1, 1, 77)))
+def test_a_summary_does_not_depend_on_the_boxes(summed: Summed) -> None:
+    trials, summary, whole = summed
+    cut = summarise(trials, whole, BoxLayout((3, 2, 300), (1, 1, 77)))
     xr.testing.assert_allclose(cut, summary, rtol=1e-12)
 
 
@@ -358,17 +363,13 @@ def by_value() -> Iterator[None]:
 def test_a_cluster_that_loses_a_worker_finds_the_same(tmp_path: Path, by_value: None) -> None:
     import psutil
 
-    here = open_store(tmp_path / "here.zarr", Fake(config()))
-    run_here(here)
+    here = stored(tmp_path / "here.zarr")
     marked = tmp_path / "marked"
     study = Fake(config())
     study.slow_s = 0.1
     there = open_store(tmp_path / "there.zarr", study, 5)
     killed: list[int] = []
-    with (
-        local_cluster(2) as owner,
-        remote_cluster(owner.scheduler.address, marked.touch) as client,
-    ):
+    with local_cluster(2) as owner, remote_cluster(owner.scheduler.address, marked.touch) as client:
 
         def kill_one(done: int) -> None:
             if not killed:
@@ -376,10 +377,10 @@ def test_a_cluster_that_loses_a_worker_finds_the_same(tmp_path: Path, by_value: 
                 killed.append(next(iter(workers.values())))
                 psutil.Process(killed[0]).kill()
 
-        run_on_cluster(there, client, "--workers", kill_one)
+        run_on_cluster(study, there, client, "--workers", kill_one)
     assert killed
     assert marked.exists()  # every worker was prepared
-    xr.testing.assert_identical(read_dataset(here.path), read_dataset(there.path))
+    xr.testing.assert_identical(here.dataset(), there.dataset())
 
 
 def test_workers_that_die_for_good_are_one_line(tmp_path: Path, by_value: None) -> None:
@@ -393,8 +394,8 @@ def test_workers_that_die_for_good_are_one_line(tmp_path: Path, by_value: None) 
         local_cluster(1) as client,
         pytest.raises(BadInput, match="--workers: a box killed one worker after the other"),
     ):
-        run_on_cluster(store, client, "--workers")
-    assert count_done(store.path) == 0
+        run_on_cluster(study, store, client, "--workers")
+    assert store.count_done() == 0
 
 
 def test_a_scheduler_that_goes_is_one_line(tmp_path: Path, by_value: None) -> None:
@@ -407,8 +408,8 @@ def test_a_scheduler_that_goes_is_one_line(tmp_path: Path, by_value: None) -> No
         remote_cluster(owner.scheduler.address, lambda: None, timeout_s=2.0) as client,
         pytest.raises(BadInput, match=r"--scheduler: the scheduler is gone; what is done is kept"),
     ):
-        run_on_cluster(store, client, "--scheduler", lambda done: owner.cluster.close())
-    assert 0 < count_done(store.path) < 120
+        run_on_cluster(study, store, client, "--scheduler", lambda done: owner.cluster.close())
+    assert 0 < store.count_done() < 120
 
 
 @pytest.mark.parametrize(
@@ -485,8 +486,8 @@ def test_memory_does_not_grow_with_the_study(tmp_path: Path) -> None:
         study = Many(config(trials=trials, axes={"a_m": [1, 2], "selector": ["x", "z"]}))
         store = open_store(tmp_path / f"{trials}.zarr", study, 5_000)
         tracemalloc.start()
-        run_here(store)
-        summarise(read_dataset(store.path), study.grid, store.layout)
+        run_here(study, store)
+        summarise(store.dataset(), study.config, store.layout)
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         return peak

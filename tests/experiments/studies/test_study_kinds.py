@@ -23,9 +23,8 @@ from jaxnav.errors import BadInput
 from jaxnav.experiments.studies import lanes
 from jaxnav.experiments.studies.ambiguity import FLIPPED, INVALID, RIGHT, SCHEMA, UNSEEN
 from jaxnav.experiments.studies.drives import DriveStudy
-from jaxnav.experiments.studies.layout import BoxLayout
 from jaxnav.experiments.studies.running import run_here
-from jaxnav.experiments.studies.store import count_done, open_store, read_dataset, read_layout
+from jaxnav.experiments.studies.store import BoxLayout, StudyStore, open_store
 from jaxnav.experiments.studies.summary import summarise
 from jaxnav.sim.rollout import Rollout
 from jaxnav.sim.scenarios import on_laps, scenarios
@@ -54,9 +53,10 @@ def frames(tmp_path_factory: pytest.TempPathFactory) -> tuple[xr.Dataset, xr.Dat
     study = load_study("ambiguity", folder / "study.yaml")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lanes, "BATCH", 512)
-        run_here(open_store(folder / "s.zarr", study, 900))
-    trials = read_dataset(folder / "s.zarr")
-    return trials, summarise(trials, study.grid, read_layout(folder / "s.zarr"))
+        store = open_store(folder / "s.zarr", study, 900)
+        run_here(study, store)
+    trials = store.dataset()
+    return trials, summarise(trials, study.config, store.layout)
 
 
 def opencv_flip_rate(range_m: float, noise_px: float, count: int) -> tuple[float, int]:
@@ -155,12 +155,13 @@ def test_a_lane_that_overflows_is_counted(tmp_path: Path) -> None:
     study = load_study("ambiguity", tmp_path / "s.yaml")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lanes, "BATCH", 16)
-        run_here(open_store(tmp_path / "s.zarr", study))
-    trials = read_dataset(tmp_path / "s.zarr")
+        store = open_store(tmp_path / "s.zarr", study)
+        run_here(study, store)
+    trials = store.dataset()
     outcome = trials["outcome"].values
     assert np.all(outcome[1] == INVALID)
     assert set(outcome[0]) <= {RIGHT, FLIPPED}
-    summary = summarise(trials, study.grid, read_layout(tmp_path / "s.zarr"))
+    summary = summarise(trials, study.config, store.layout)
     assert list(summary["invalid_rate"].values) == [0, 1]
     assert summary["position_error_m_counted"].values[0] == 8
     assert np.isfinite(summary["position_error_m_median"].values[0])
@@ -173,13 +174,13 @@ def test_drives_are_those_of_simulate(tmp_path: Path) -> None:
     )
     study = load_study("drive", tmp_path / "s.yaml")
     assert isinstance(study, DriveStudy)
-    cells = [study.grid.cell((0,)), study.grid.cell((1,))]
+    cells = [study.config.cell((0,)), study.config.cell((1,))]
     found = study.run(cells, range(6))
     told: list[int] = []
     part = study.run(cells[1:], range(2, 5), told.append)
     assert sum(told) == 3  # and not the six lanes
     told.clear()
-    run_here(open_store(tmp_path / "s.zarr", study), told.append)  # both cells in one box
+    run_here(study, open_store(tmp_path / "s.zarr", study), told.append)  # both cells in one box
     assert sum(told) == 12
     assert max(told) <= 6
     for name, values in found.items():
@@ -208,7 +209,7 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
     study = load_study("drive", tmp_path / "s.yaml")
     assert isinstance(study, DriveStudy)
     for index, name in enumerate(("paper", "everything")):
-        cell, usual = study.grid.cell((index,)), scenarios()[name]
+        cell, usual = study.config.cell((index,)), scenarios()[name]
         scenario = study.scenario(cell)
         assert scenario.waypoints_m == on_laps(usual, 2).waypoints_m
         assert (scenario.corner_correlation, scenario.corner_lag_s) == (1, 0.06)
@@ -224,7 +225,7 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
     (tmp_path / "s.yaml").write_text("trials: 2\naxes: {scenario: [drifting-corners]}\n")
     own = load_study("drive", tmp_path / "s.yaml")
     assert isinstance(own, DriveStudy)
-    cell = own.grid.cell((0,))
+    cell = own.config.cell((0,))
     assert float(own.rollout(cell, own.scenario(cell)).corner_drift_px) == 0.5
 
 
@@ -236,7 +237,7 @@ def test_a_drive_study_varies_what_drives_and_its_gyro(tmp_path: Path) -> None:
     assert isinstance(study, DriveStudy)
     car, omni = (
         study.rollout(cell, study.scenario(cell))
-        for cell in (study.grid.cell((index,)) for index in range(2))
+        for cell in (study.config.cell((index,)) for index in range(2))
     )
     assert isinstance(car.vehicle, Vehicle)
     assert isinstance(omni.vehicle, TwistBase)
@@ -280,21 +281,21 @@ def test_killed_continued_elsewhere_the_bits_stay_the_same(
     }
     parts, total = tmp_path / "parts.zarr", 6 * TRIALS
     process = command(*study, parts, "--chunk-trials", 200, **two)
-    while not parts.exists() or count_done(parts) < 200:
+    while not parts.exists() or StudyStore(parts).count_done() < 200:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
     process.kill()
     process.communicate()
-    assert 200 <= count_done(parts) < total
+    assert 200 <= StudyStore(parts).count_done() < total
     out = finished(command(*study, parts, **two))
     assert f"of {total} trials: going on" in out
-    xr.testing.assert_identical(read_dataset(parts), whole)
+    xr.testing.assert_identical(StudyStore(parts).dataset(), whole)
 
 
 def test_an_interrupted_study_says_how_to_go_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(store: object, progress: object) -> None:
+    def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("jaxnav.commands.study.study.configure_jax", lambda float64: None)
@@ -307,9 +308,7 @@ def test_an_interrupted_study_says_how_to_go_on(
 
 
 def test_a_study_is_drawn(
-    frames: tuple[xr.Dataset, xr.Dataset],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    frames: tuple[xr.Dataset, xr.Dataset], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import matplotlib.image
 
@@ -341,8 +340,7 @@ def test_the_shipped_configs_are_studies(kind: str, capsys: pytest.CaptureFixtur
     assert len(names) >= 2
     for name in names:
         study = load_study(kind, Path(name))
-        lengths = [len(values) for values in study.grid.outer_axes.values()]
-        assert BoxLayout.of([*lengths, study.config.trials], 100).trials > 1000
+        assert BoxLayout.from_shape(study.config.shape, 100).trials > 1000
     assert main(["study", kind, "list"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in [*names, *study.schema.parameters])

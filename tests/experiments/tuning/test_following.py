@@ -41,7 +41,7 @@ NAVIGATOR = Navigator(
         hypotheses=6, outlier_log_evidence=-3.0, decided_mass=0.02, decided_sigma_rad=0.3
     ),
 )  # fmt: skip
-SPACE = Space.of(
+SPACE = Space.from_navigator(
     NAVIGATOR,
     dict.fromkeys(
         [
@@ -275,7 +275,7 @@ def test_a_gyro_s_numbers_are_learned_by_their_gradients():
     navigator = Navigator(RIG, MARKERS, base)
     names = [name for name in parameters_of(navigator) if ".gyro." in name]
     assert len(names) == 5
-    space = Space.of(navigator, dict.fromkeys(names, True))
+    space = Space.from_navigator(navigator, dict.fromkeys(names, True))
     turns = jnp.asarray([[0.3, 1.0, 1.03], [0.3, 1.4, 0.9], [0.0, 0.0, 0.02], [0.0, 0.0, 0.02]])
     weights = jnp.asarray(
         np.random.default_rng(0).normal(size=(navigator.motion.init().mean.size,))

@@ -82,7 +82,7 @@ def loop(softness_m=0.03, navigator=None, spread=SPREAD, **changes) -> ClosedLoo
 
 
 def space_of(closed: ClosedLoop) -> Space:
-    return Space.of(closed.rollout.navigator, dict.fromkeys(GAINS, True))
+    return Space.from_navigator(closed.rollout.navigator, dict.fromkeys(GAINS, True))
 
 
 def moved(space: Space, name: str, by: float) -> jax.Array:
@@ -143,7 +143,7 @@ def test_derivatives_of_a_base_s_drive(left_limit_mps):
     steers = TurnsByGyro(RIG, MARKERS, base, worlds.WAYPOINTS_M, selector=LowestReprojection())
     rollout = Rollout(steers, base, MARKERS, scenario(), 1.0, spread=SPREAD, chunk_frames=45)
     closed = ClosedLoop(rollout, DriveLoss(), 0.03)
-    space, seeds = Space.of(steers, dict.fromkeys(names, True)), keys(jnp.arange(3))
+    space, seeds = Space.from_navigator(steers, dict.fromkeys(names, True)), keys(jnp.arange(3))
     slopes = slopes_as_differences(closed, space, seeds)
     # What moves to its left never turns on the spot.
     idle = names[2:] if left_limit_mps else []
@@ -223,7 +223,10 @@ def test_through_the_whole_navigator():
     )  # fmt: skip
     rollout = Rollout(navigator, CAR, MARKERS, route, 1.0, spread=SPREAD, chunk_frames=18)
     closed = ClosedLoop(rollout)
-    space, seeds = Space.of(navigator, {GAINS[0]: True, GAINS[3]: True}), keys(jnp.arange(2))
+    space, seeds = (
+        Space.from_navigator(navigator, {GAINS[0]: True, GAINS[3]: True}),
+        keys(jnp.arange(2)),
+    )
     slopes_as_differences(closed, space, seeds, step=1e-4, rtol=1e-3)
     silent = dataclasses.replace(rollout, corner_noise_px=0.0 * rollout.corner_noise_px)
     closed = dataclasses.replace(closed, rollout=silent)

@@ -26,7 +26,7 @@ MATRICES = frozenset(name for name, tunable in TUNABLES.items() if tunable.matri
 
 
 def everything(navigator: Navigator, full: frozenset[str] = frozenset()) -> Space:
-    return Space.of(navigator, dict.fromkeys(parameters_of(navigator), True), full)
+    return Space.from_navigator(navigator, dict.fromkeys(parameters_of(navigator), True), full)
 
 
 @functools.cache
@@ -175,7 +175,7 @@ def test_a_full_one_is_log_cholesky():
     rng, name = np.random.default_rng(3), "motion.odometry_sigma"
     P = random_covariance(rng, 3, 0.01)
     navigator = with_parameters(CAR, {name: jnp.asarray(P)})
-    space = Space.of(navigator, {name: True}, frozenset({name}))
+    space = Space.from_navigator(navigator, {name: True}, frozenset({name}))
     L = cholesky(P, lower=True) / TUNABLES[name].typical
     expected = np.tril(L, -1) + np.diag(np.log(np.diagonal(L)))
     np.testing.assert_allclose(space.start.reshape(3, 3), expected, rtol=1e-9, atol=1e-12)
@@ -184,7 +184,7 @@ def test_a_full_one_is_log_cholesky():
 def test_a_gain_is_a_softplus():
     """Its slope is that of the logistic function, in units of what is typical over log 2."""
     name = "controller.proportional_per_m"
-    space = Space.of(CAR, {name: True})
+    space = Space.from_navigator(CAR, {name: True})
     for x in (-5.0, 0.0, 3.0, 30.0):
         slope = jax.grad(lambda x: space.values(x)[name].sum())(jnp.asarray([x]))
         expected = TUNABLES[name].typical / np.log(2) * expit(x)
@@ -205,7 +205,7 @@ def test_labels_say_whose_an_entry_is():
         "selector.floor_m": True, "motion.odometry_sigma": True, "corner_sigma_px": False,
         "controller.lookahead_m": True, "motion.acceleration_density": True,
     }  # fmt: skip
-    space = Space.of(CAR, trainable, full)
+    space = Space.from_navigator(CAR, trainable, full)
     assert set(space.labels) == {name for name, moves in trainable.items() if moves}
     assert len(space.labels) == space.start.size == 1 + 9 + 1 + 3
     jacobian = jax.jit(jax.jacobian(lambda x: space.values(x)))(space.start + 0.3)
@@ -220,9 +220,9 @@ def test_labels_say_whose_an_entry_is():
 
 def test_what_can_t_be_is_named():
     with pytest.raises(ValueError, match=r"motion.mass_kg: unknown: expected one of motion\."):
-        Space.of(CAR, {"motion.mass_kg": True})
+        Space.from_navigator(CAR, {"motion.mass_kg": True})
     with pytest.raises(ValueError, match=r"controller\.lookahead_m: unknown"):
-        Space.of(HANDHELD, {"controller.lookahead_m": True})
+        Space.from_navigator(HANDHELD, {"controller.lookahead_m": True})
     with pytest.raises(ValueError, match=r"selector\.floor_m: is no covariance"):
-        Space.of(CAR, {"selector.floor_m": True}, frozenset({"selector.floor_m"}))
-    assert Space.of(CAR, {"motion.mass_kg": False}).start.size == 0
+        Space.from_navigator(CAR, {"selector.floor_m": True}, frozenset({"selector.floor_m"}))
+    assert Space.from_navigator(CAR, {"motion.mass_kg": False}).start.size == 0

@@ -35,7 +35,7 @@ HEADER = {
     name: yaml.safe_load((QCAR / f"{name}.yaml").read_text())
     for name in ("rig", "markers", "route")
 }
-SCENERY = Scenery.of(HEADER)
+SCENERY = Scenery.from_header(HEADER)
 COUNT = 30
 CAMERAS = ("front", "right", "rear", "left")
 CORNERS_PX = np.array([[[10.0, 10.0], [20.0, 10.0], [20.0, 20.0], [10.0, 20.0]]])

@@ -1,5 +1,6 @@
 """The checks for plug-ins: a good plug-in passes, and each fault of a bad one is named."""
 
+import itertools
 import threading
 import time
 from types import SimpleNamespace
@@ -10,13 +11,7 @@ import pytest
 from jaxnav.detection.types import Detections
 from jaxnav.drive.interfaces import Frame, Odometry
 from jaxnav.vehicles.conformance import check_cameras, check_vehicle
-from tests.helpers.setups import (
-    FULL_THROTTLE,
-    GoodCamera,
-    GoodVehicle,
-    good_cameras,
-    setup_with,
-)
+from tests.helpers.setups import FULL_THROTTLE, GoodCamera, GoodVehicle, good_cameras, setup_with
 
 SETUP = setup_with()
 SHORT_RIG = setup_with(SETUP.rig.first(2))
@@ -37,71 +32,8 @@ def test_a_good_vehicle_passes():
     assert threading.active_count() <= before
 
 
-class NoStop(GoodVehicle):
-    stop = None
-
-
-class NoTimeout(GoodVehicle):
-    timeout_s = 0.0
-
-
-class TextTimeout(GoodVehicle):
-    timeout_s = "soon"
-
-
-class NotANumber(GoodVehicle):
-    def read(self):
-        return Odometry(time.monotonic_ns(), float("nan"), 0.0)
-
-
-class FloatStamp(GoodVehicle):
-    def read(self):
-        return Odometry(time.monotonic(), 0.0, 0.0)
-
-
-class WallClock(GoodVehicle):
-    def read(self):
-        return Odometry(time.time_ns(), 0.0, 0.0)
-
-
-class BootClock(GoodVehicle):
-    def read(self):
-        return Odometry(time.monotonic_ns() - 3_000_000_000, 0.0, 0.0)
-
-
-class ClockStandsStill(GoodVehicle):
-    def read(self):
-        self.stamp_ns = getattr(self, "stamp_ns", time.monotonic_ns())
-        return Odometry(self.stamp_ns, 0.0, 0.0)
-
-
-class GoesBack(GoodVehicle):
-    count = 0
-
-    def read(self):
-        self.count += 1
-        return Odometry(time.monotonic_ns() - 20_000_000 * (self.count % 3), 0.0, 0.0)
-
-
-class SlowRead(GoodVehicle):
-    def read(self):
-        time.sleep(0.06)
-        return super().read()
-
-
-class NoReading(GoodVehicle):
-    def read(self):
-        return None
-
-
-class AlwaysBroken(GoodVehicle):
-    def read(self):
-        raise OSError("no cable")
-
-
-class NeverValid(GoodVehicle):
-    def read(self):
-        return Odometry(time.monotonic_ns(), 0.0, 0.0, valid=False)
+def no_cable(self):
+    raise OSError("no cable")
 
 
 class RaisesValueError(GoodVehicle):
@@ -129,11 +61,6 @@ class StopWaits(GoodVehicle):
         self.stops = False
 
 
-class StopHangs(GoodVehicle):
-    def stop(self):
-        threading.Event().wait()
-
-
 class OneThreadOnly(GoodVehicle):
     """As many a driver: what was begun in one thread must not be touched by another."""
 
@@ -146,11 +73,6 @@ class OneThreadOnly(GoodVehicle):
     def stop(self):
         if self.thread != threading.get_ident():
             raise RuntimeError("wrong thread")
-
-
-class StopForgets(GoodVehicle):
-    def stop(self):
-        pass
 
 
 class ReadDrivesOn(GoodVehicle):
@@ -166,16 +88,6 @@ class ReadDrivesOn(GoodVehicle):
         return super().read()
 
 
-class CloseDrivesOn(GoodVehicle):
-    def close(self):
-        self.closed = True
-
-
-class WriteAfterClose(GoodVehicle):
-    def write(self, steering_rad, throttle):
-        self.throttle = throttle
-
-
 class CloseOnce(GoodVehicle):
     def close(self):
         if self.closed:
@@ -183,42 +95,72 @@ class CloseOnce(GoodVehicle):
         super().close()
 
 
+def broken(**changes):
+    """A vehicle with other members."""
+    return type("Broken", (GoodVehicle,), changes)
+
+
+def reads(stamp_ns=time.monotonic_ns, speed_mps=0.0, valid=True):
+    """A vehicle with other readings."""
+    return broken(read=lambda self: Odometry(stamp_ns(), speed_mps, 0.0, valid))
+
+
+def backwards(count=itertools.count()):  # noqa: B008
+    return time.monotonic_ns() - 20_000_000 * (next(count) % 3)
+
+
 @pytest.mark.parametrize(
-    ("broken", "sentence"),
+    ("vehicle", "sentence"),
     [
-        (NoStop, r"the vehicle has no stop\(\)"),
-        (NoTimeout, "timeout_s must be positive, or inf, not 0.0"),
-        (TextTimeout, "timeout_s is no number but 'soon'"),
-        (NotANumber, "speed_mps of a valid Odometry must be a finite number, not nan"),
-        (FloatStamp, "stamp_ns of an Odometry must be an int"),
-        (WallClock, "stamp_ns of an Odometry lies .* s in the future"),
-        (BootClock, "stamp_ns of an Odometry is 3.* s old: it must be of time.monotonic_ns"),
-        (ClockStandsStill, r"the stamps of read\(\) stood still for 0.5 s"),
-        (GoesBack, r"the stamps of read\(\) go back in time"),
-        (SlowRead, r"read\(\) took longer than 0.05 s"),
-        (NoReading, r"read\(\) gives None, expected an Odometry"),
-        (AlwaysBroken, r"read\(\) raised OSError for 0.5 s: no cable"),
-        (NeverValid, r"no reading of read\(\) was valid"),
+        (broken(stop=None), r"the vehicle has no stop\(\)"),
+        (broken(timeout_s=0.0), "timeout_s must be positive, or inf, not 0.0"),
+        (broken(timeout_s="soon"), "timeout_s is no number but 'soon'"),
+        (reads(speed_mps=np.nan), "speed_mps of a valid Odometry must be a finite number, not nan"),
+        (reads(time.monotonic), "stamp_ns of an Odometry must be an int"),
+        (reads(time.time_ns), "stamp_ns of an Odometry lies .* s in the future"),
+        (
+            reads(lambda: time.monotonic_ns() - 3_000_000_000),
+            "stamp_ns of an Odometry is 3.* s old: it must be of time.monotonic_ns",
+        ),
+        (
+            broken(read=lambda self: self.__dict__.setdefault("first", GoodVehicle.read(self))),
+            r"the stamps of read\(\) stood still for 0.5 s",
+        ),
+        (reads(backwards), r"the stamps of read\(\) go back in time"),
+        (
+            broken(read=lambda self: time.sleep(0.06) or GoodVehicle.read(self)),
+            r"read\(\) took longer than 0.05 s",
+        ),
+        (broken(read=lambda self: None), r"read\(\) gives None, expected an Odometry"),
+        (broken(read=no_cable), r"read\(\) raised OSError for 0.5 s: no cable"),
+        (reads(valid=False), r"no reading of read\(\) was valid"),
         (RaisesValueError, r"write\(0.*\) raised ValueError: too fast; only OSError is allowed"),
         (StopWaits, r"stop\(\) took .* s"),
-        (StopHangs, r"stop\(\) did not return within 1.2 s"),
+        (
+            broken(stop=lambda self: threading.Event().wait()),
+            r"stop\(\) did not return within 1.2 s",
+        ),
         (OneThreadOnly, r"stop\(\) raised RuntimeError: wrong thread"),
-        (StopForgets, r"the throttle is 0.3 after stop\(\), it must be 0"),
+        (broken(stop=lambda self: None), r"the throttle is 0.3 after stop\(\), it must be 0"),
         (ReadDrivesOn, "the throttle is 0.3 when it is read after stop"),
-        (CloseDrivesOn, r"the throttle is 0.3 after close\(\), it must be 0"),
-        (WriteAfterClose, r"the throttle is 0.3 when it is written after close\(\)"),
+        (
+            broken(close=lambda self: setattr(self, "closed", True)),
+            r"the throttle is 0.3 after close\(\), it must be 0",
+        ),
+        (
+            broken(write=lambda self, steering_rad, throttle: setattr(self, "throttle", throttle)),
+            r"the throttle is 0.3 when it is written after close\(\)",
+        ),
         (CloseOnce, r"a second close\(\) raised RuntimeError: closed already"),
     ],
 )
-def test_a_broken_promise_of_a_vehicle_is_named(broken, sentence, monkeypatch):
-    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._PATIENCE_S", 0.5)
-    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._BUSY_S", 0.03)
-    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._STOP_S", 0.2)
-    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._READINGS", 6)
-    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle.HANGS_S", 1.2)
+def test_a_broken_promise_of_a_vehicle_is_named(vehicle, sentence, monkeypatch):
+    quick = {"_PATIENCE_S": 0.5, "_BUSY_S": 0.03, "_STOP_S": 0.2, "_READINGS": 6, "HANGS_S": 1.2}
+    for name, value in quick.items():
+        monkeypatch.setattr(f"jaxnav.vehicles.conformance.vehicle.{name}", value)
     monkeypatch.setattr("jaxnav.vehicles.conformance.calls.HANGS_S", 1.2)
     with pytest.raises(AssertionError, match=sentence):
-        check_vehicle(broken, SETUP, throttle_of)
+        check_vehicle(vehicle, SETUP, throttle_of)
 
 
 def test_a_hook_that_sees_nothing_is_named(monkeypatch):
@@ -285,10 +227,7 @@ def in_one_buffer(self):
         ),
         (
             broken_camera(
-                stamp_ns=lambda self: (
-                    setattr(self, "first", getattr(self, "first", time.monotonic_ns()))
-                    or self.first
-                )
+                stamp_ns=lambda self: self.__dict__.setdefault("first", time.monotonic_ns())
             ),
             "the camera front gives the same or an older stamp again",
         ),

@@ -178,11 +178,7 @@ def test_what_is_asked_of_a_fault_can_be_missed(trial):
     """The same measure finds fault with a drive in which the wrong thing is asked for."""
     tunnel = next(row for row in MATRIX if row.name == "tunnel, 5 s")
     asked = dataclasses.replace(
-        tunnel,
-        faults=Fault.ODOMETRY_STUCK,
-        health=(Health.OK, Health.OK),
-        error_m=0.0,
-        drive_s=9.0,
+        tunnel, faults=Fault.ODOMETRY_STUCK, health=(Health.OK, Health.OK), error_m=0.0, drive_s=9.0
     )
     broken = run_trial(asked, trial).broken
     assert any("ODOMETRY_STUCK" in said for said in broken)

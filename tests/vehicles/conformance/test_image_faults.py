@@ -3,7 +3,6 @@
 Nothing raises. Visible markers are found in their places, and no others are invented.
 """
 
-import time
 from collections.abc import Callable
 
 import cv2
@@ -311,18 +310,3 @@ def test_where_it_is_not_the_whole_image_is_looked_at(camera, image, corners_px)
     detector = make_detector("aruco", FAMILY)
     assert len(detector.detect_near(image, camera, elsewhere.quads_px, elsewhere.radius_px)) == 0
     assert_found(looked(camera, image, elsewhere).detections, corners_px, 0.1)
-
-
-def test_to_look_where_it_is_expected_saves_time(camera, image, corners_px):
-    """How much is printed, not asserted: the machine may do something else."""
-    region = around(corners_px)
-    times_ms: tuple[list[float], list[float]] = ([], [])
-    for _ in range(9):
-        for times, where in zip(times_ms, (None, region), strict=True):
-            search = new_search(camera)
-            begin_s = time.perf_counter()
-            sighted = search.look(Frame(BEGIN_NS, image), where)
-            times.append((time.perf_counter() - begin_s) * 1e3)
-            assert_found(sighted.detections, corners_px, 0.1)
-    whole_ms, near_ms = np.median(times_ms, axis=1)
-    print(f"the whole image {whole_ms:.2f} ms, the region {near_ms:.2f} ms")
