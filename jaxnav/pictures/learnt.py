@@ -8,7 +8,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import SENSOR_ERRORS, Vehicle
 from jaxnav.pictures.localisation import BLUE, GREEN, ORANGE
 from jaxnav.recordings.learnt import Learnt
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 
 _POINTS = 400  # of a curve, at most
 _UNITS = {"steering_offset_rad": " (rad)", "camera_delay_s": " (s)"}
@@ -21,7 +21,10 @@ def learnt_over_time(outcomes: Outcomes, rig: CameraRig, vehicle: Vehicle) -> Fi
     """
     known = np.flatnonzero(np.isfinite(outcomes.errors).all(axis=1) & outcomes.located)
     shown = known[np.unique(np.linspace(0, len(known) - 1, _POINTS).astype(int))]
-    states = [Learnt.of(outcomes.errors[i], outcomes.errors_sigma[i], rig, vehicle) for i in shown]
+    states = [
+        Learnt.from_errors(outcomes.errors[i], outcomes.errors_sigma[i], rig, vehicle)
+        for i in shown
+    ]
     learnt = [state for state in states if state is not None]
     times_s = outcomes.times_s[shown]
     columns = max(len(rig), len(SENSOR_ERRORS))

@@ -20,7 +20,8 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import Writer
 
 from jaxnav.recordings.drive_format import header_metadata
-from jaxnav.recordings.message_schemas import MESSAGES
+from jaxnav.recordings.records import MESSAGES
+from tests.helpers.drives import OUTCOME, REPORTED
 
 GIB = 2**30
 HUGE_PX = 30_000  # OpenCV itself refuses more than 2**30 pixels
@@ -230,16 +231,8 @@ def mcap_detections(path: Path) -> Path:
 
 def mcap_covariance(path: Path) -> Path:
     """One covariance of 500 x 500, and a table that would have a row of it for each outcome."""
-    plain = {
-        "now_ns": 1, "health": "OK", "faults": [], "rejects": [], "steering_rad": 0.0,
-        "throttle": 0.0, "restarts": 0, "reason": "", "digest": "",
-    }  # fmt: skip
-    told = {
-        "pose": [0.0] * 3, "covariance": [1.0] * 250_000, "flip_probability": 0.0, "nis": 0.0,
-        "hypothesis": 0, "hypotheses": [0.0] * 3, "log_weight": [0.0], "selected": -1,
-        "Ts_vehicle_world": [0.0] * 7, "costs": [0.0],
-    }  # fmt: skip
-    return _mcap(path, "/outcome", [plain | told, *[plain] * 3000])
+    whole = OUTCOME | REPORTED | {"covariance": [1.0] * 250_000}
+    return _mcap(path, "/outcome", [whole, *[OUTCOME] * 3000])
 
 
 PICTURES: dict[str, Callable[[Path], Path]] = {

@@ -20,9 +20,8 @@ from mcap.reader import make_reader
 from jaxnav.errors import BadInput
 from jaxnav.recordings import recorder as recorder_module
 from jaxnav.recordings.drive_log import read_drive
-from jaxnav.recordings.messages import input_message
-from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message, outcome_message
 from tests.helpers.drives import (
     make_input,
     make_outcome,
@@ -337,7 +336,7 @@ def test_a_pipe_that_nobody_empties(tmp_path):
 CHILD = """
 import sys, time
 from jaxnav.drive.interfaces import Odometry
-from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.records import input_message
 from jaxnav.drive.pilot import Input
 from jaxnav.recordings.recorder import Recorder
 

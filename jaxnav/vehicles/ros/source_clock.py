@@ -1,4 +1,4 @@
-"""When a topic's messages were stamped, on the clock of the program.
+"""Convert the stamps of one topic to the clock of the program.
 
 A source whose stamps are of this computer's clock is believed from then on: stamps that repeat,
 stand still or jump stay what they are, and the pilot refuses them. Stamps of another computer's
@@ -47,14 +47,14 @@ class SourceClock:
         if self._offset is None:
             return stamped_ns
         now_ns = time.monotonic_ns()
-        told_ns = stamped_ns + self._offset.ns()
-        is_ours = -_STEP_NS <= now_ns - told_ns <= _OLDEST_NS
+        ours_ns = stamped_ns + self._offset.ns()
+        is_ours = -_STEP_NS <= now_ns - ours_ns <= _OLDEST_NS
         self._in_a_row = self._in_a_row + 1 if is_ours else 0
         if not self._believed:
             first = self._believed is None
             self._believed = self._in_a_row >= (1 if first else _BELIEVED_AFTER)
         if self._believed:
-            return told_ns
+            return ours_ns
         if not stamped_ns or stamped_ns != self._last[0]:
             self._last = stamped_ns, now_ns
         return self._last[1]
