@@ -25,7 +25,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import jax
 import numpy as np
@@ -231,31 +231,31 @@ class FramesMessage(TickMessage):
 class ReadingMessage(TickMessage):
     """What the two kinds of odometry share: its stamp, and the frames that showed nothing."""
 
+    VALUES: ClassVar[tuple[str, ...]]  # the fields that were read, in the order of `values`
     stamp_ns: Stamp
     valid: Flag
     frames: list[FrameMessage] = Field(default_factory=list)
+
+    def _reading(self) -> Reading:
+        values = [getattr(self, name) for name in self.VALUES]
+        return reading_of(self.stamp_ns, values, self.valid)
 
 
 class OdometryMessage(ReadingMessage):
     """An `Input` with `Odometry`."""
 
+    VALUES = ("speed_mps", "steering_rad")
     speed_mps: Real
     steering_rad: Real
-
-    def _reading(self) -> Reading:
-        return reading_of(self.stamp_ns, (self.speed_mps, self.steering_rad), self.valid)
 
 
 class TwistMessage(ReadingMessage):
     """An `Input` with `TwistOdometry`."""
 
+    VALUES = ("forward_mps", "left_mps", "turn_radps")
     forward_mps: Real
     left_mps: Real
     turn_radps: Real
-
-    def _reading(self) -> Reading:
-        values = self.forward_mps, self.left_mps, self.turn_radps
-        return reading_of(self.stamp_ns, values, self.valid)
 
 
 def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
@@ -270,7 +270,7 @@ def input_message(given: Input) -> tuple[str, int, dict[str, Any]]:
         topic, stamp_ns = (FRAMES, given.frames[0].stamp_ns) if given.frames else (TICK, None)
         return topic, given.now_ns if stamp_ns is None else stamp_ns, message
     of_car = isinstance(reading, Odometry)
-    names = ("speed_mps", "steering_rad") if of_car else ("forward_mps", "left_mps", "turn_radps")
+    names = (OdometryMessage if of_car else TwistMessage).VALUES
     message |= _reading_message(reading, *names) | {"valid": bool(reading.valid)}
     return ODOMETRY if of_car else TWIST, reading.stamp_ns, message
 
