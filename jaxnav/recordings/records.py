@@ -369,13 +369,26 @@ _flag = partial(_column, Flag, dtype=bool, default=False, is_reported=True, slac
 _newer = partial(_column, default=None, missing=np.nan)  # older drives have none
 
 
-def _rows(*row: int) -> dict[str, Any]:
+def _array(kind: Any, of: _Of, shape: tuple[int, ...]) -> Column:
+    return _reported(kind, of, float, shape=shape, missing=np.nan, slack=1)
+
+
+def _rows(of: _Of, *row: int) -> Column:
     """Any number of rows, which differ from outcome to outcome."""
     kind = Annotated[np.ndarray, Array(shape=(-1, *row))]
-    return {"kind": kind, "missing": np.zeros((0, *row))}
+    return _reported(kind, of, missing=np.zeros((0, *row)))
 
 
-def _errors_sigma(one: Outcome) -> np.ndarray:
+def _named(kind: Any, name: str) -> Column:
+    return _column(kind, lambda one: list(getattr(one, name)) or None, default=[], missing=[])
+
+
+def _errors(one: Outcome) -> np.ndarray:
+    bank = one.belief.bank
+    return np.asarray(bank.mean[errors_at(bank)])
+
+
+def _sigma(one: Outcome) -> np.ndarray:
     bank = one.belief.bank
     return error_sigmas(np.asarray(bank.covariance[errors_at(bank)[0]]))
 
@@ -395,11 +408,26 @@ def _Ts_vehicle_world(one: Outcome) -> np.ndarray:
     return np.asarray(inverses_in_world(Ts, one.origin_m))
 
 
+def _costs(one: Outcome) -> np.ndarray:
+    return np.asarray(one.output.costs[one.output.candidates.valid])
+
+
 def _selected(one: Outcome) -> int:
     selected = int(one.output.selected)
     return int(np.sum(one.output.candidates.valid[:selected])) if selected >= 0 else -1
 
 
+def _share(one: Outcome) -> float | None:
+    return repeated_share(one.belief)
+
+
+def _twist(one: Outcome) -> np.ndarray | None:
+    return None if one.twist is None else np.array(one.twist, float)
+
+
+_Ints = Int[np.ndarray, " N"]
+_Reals = Float[np.ndarray, " N"]
+_Bools = Bool[np.ndarray, " N"]
 _NUMBERS = Annotated[np.ndarray, Array()]
 _THREE = Annotated[np.ndarray, Array(shape=(3,))]
 _SQUARE = Annotated[np.ndarray, Array(), AfterValidator(_square)]
@@ -431,84 +459,35 @@ class Outcomes:
             car.
     """
 
-    now_ns: Annotated[Int[np.ndarray, " N"], _column(Now, "now_ns", np.int64)]
-    stamp_ns: Annotated[
-        Int[np.ndarray, " N"], _column(Stamp, "stamp_ns", np.int64, default=None, missing=-1)
-    ]
-    health: Annotated[Int[np.ndarray, " N"], _column(_HEALTH, "health", int, slack=0)]
-    faults: Annotated[Int[np.ndarray, " N"], _column(Faults, "faults", int, slack=0)]
-    rejects: Annotated[Int[np.ndarray, " N"], _column(_REJECTS, "rejects", int, slack=0)]
-    steering_rad: Annotated[Float[np.ndarray, " N"], _column(Real, "steering_rad", float, slack=1)]
-    throttle: Annotated[Float[np.ndarray, " N"], _column(Real, "throttle", float, slack=1)]
-    restarts: Annotated[Int[np.ndarray, " N"], _column(Count, "restarts", int, slack=0)]
+    now_ns: Annotated[_Ints, _column(Now, "now_ns", np.int64)]
+    stamp_ns: Annotated[_Ints, _column(Stamp, "stamp_ns", np.int64, default=None, missing=-1)]
+    health: Annotated[_Ints, _column(_HEALTH, "health", int, slack=0)]
+    faults: Annotated[_Ints, _column(Faults, "faults", int, slack=0)]
+    rejects: Annotated[_Ints, _column(_REJECTS, "rejects", int, slack=0)]
+    steering_rad: Annotated[_Reals, _column(Real, "steering_rad", float, slack=1)]
+    throttle: Annotated[_Reals, _column(Real, "throttle", float, slack=1)]
+    restarts: Annotated[_Ints, _column(Count, "restarts", int, slack=0)]
     reason: Annotated[tuple[str, ...], _column(Word, "restart_reason")]
     digest: Annotated[tuple[str, ...], _column(Word, lambda one: "")]
-    pose: Annotated[
-        Float[np.ndarray, "N 3"],
-        _reported(_THREE, "pose", float, shape=(3,), missing=np.nan, slack=1),
-    ]
-    covariance: Annotated[
-        Float[np.ndarray, "N d d"],
-        _reported(_SQUARE, "output.covariance", float, shape=(0, 0), missing=np.nan, slack=1),
-    ]
-    located: Annotated[Bool[np.ndarray, " N"], _flag("output.located")]
-    decided: Annotated[Bool[np.ndarray, " N"], _flag("output.decided")]
-    done: Annotated[Bool[np.ndarray, " N"], _flag("output.done")]
-    flip_probability: Annotated[
-        Float[np.ndarray, " N"], _number("output.flip_probability", slack=1)
-    ]
-    nis: Annotated[Float[np.ndarray, " N"], _number("output.nis", slack=_NIS_SLACK)]
-    hypothesis: Annotated[Int[np.ndarray, " N"], _index("output.hypothesis")]
-    hypotheses: Annotated[
-        tuple[Float[np.ndarray, "K 3"], ...], _reported(of=_hypotheses, **_rows(3))
-    ]
-    log_weight: Annotated[
-        tuple[Float[np.ndarray, " K"], ...],
-        _reported(
-            of=lambda one: one.belief.bank.log_weight[one.belief.bank.initialised], **_rows()
-        ),
-    ]
-    Ts_vehicle_world: Annotated[
-        tuple[Float[np.ndarray, "M 7"], ...], _reported(of=_Ts_vehicle_world, **_rows(7))
-    ]
-    costs: Annotated[
-        tuple[Float[np.ndarray, " M"], ...],
-        _reported(of=lambda one: one.output.costs[one.output.candidates.valid], **_rows()),
-    ]
-    selected: Annotated[Int[np.ndarray, " N"], _index(_selected)]
-    errors: Annotated[
-        Float[np.ndarray, "N e"],
-        _newer(
-            _NUMBERS,
-            lambda one: one.belief.bank.mean[errors_at(one.belief.bank)],
-            float,
-            shape=(0,),
-        ),
-    ]
-    errors_sigma: Annotated[
-        Float[np.ndarray, "N e"], _newer(_NUMBERS, _errors_sigma, float, shape=(0,))
-    ]
-    outvoted: Annotated[
-        tuple[list[int], ...],
-        _column(list[Count], lambda one: list(one.outvoted) or None, default=[], missing=[]),
-    ]
-    outvoted_cameras: Annotated[
-        tuple[list[str], ...],
-        _column(list[Word], lambda one: list(one.outvoted_cameras) or None, default=[], missing=[]),
-    ]
-    repeated_share: Annotated[
-        Float[np.ndarray, " N"], _newer(Real, lambda one: repeated_share(one.belief), float)
-    ]
-    twist: Annotated[
-        Float[np.ndarray, "N 3"],
-        _newer(
-            _THREE,
-            lambda one: None if one.twist is None else np.array(one.twist, float),
-            float,
-            shape=(3,),
-            slack=1,
-        ),
-    ]
+    pose: Annotated[Float[np.ndarray, "N 3"], _array(_THREE, "pose", (3,))]
+    covariance: Annotated[Float[np.ndarray, "N d d"], _array(_SQUARE, "output.covariance", (0, 0))]
+    located: Annotated[_Bools, _flag("output.located")]
+    decided: Annotated[_Bools, _flag("output.decided")]
+    done: Annotated[_Bools, _flag("output.done")]
+    flip_probability: Annotated[_Reals, _number("output.flip_probability", slack=1)]
+    nis: Annotated[_Reals, _number("output.nis", slack=_NIS_SLACK)]
+    hypothesis: Annotated[_Ints, _index("output.hypothesis")]
+    hypotheses: Annotated[tuple[Float[np.ndarray, "K 3"], ...], _rows(_hypotheses, 3)]
+    log_weight: Annotated[tuple[Float[np.ndarray, " K"], ...], _rows(_log_weight)]
+    Ts_vehicle_world: Annotated[tuple[Float[np.ndarray, "M 7"], ...], _rows(_Ts_vehicle_world, 7)]
+    costs: Annotated[tuple[Float[np.ndarray, " M"], ...], _rows(_costs)]
+    selected: Annotated[_Ints, _index(_selected)]
+    errors: Annotated[Float[np.ndarray, "N e"], _newer(_NUMBERS, _errors, float, shape=(0,))]
+    errors_sigma: Annotated[Float[np.ndarray, "N e"], _newer(_NUMBERS, _sigma, float, shape=(0,))]
+    outvoted: Annotated[tuple[list[int], ...], _named(list[Count], "outvoted")]
+    outvoted_cameras: Annotated[tuple[list[str], ...], _named(list[Word], "outvoted_cameras")]
+    repeated_share: Annotated[_Reals, _newer(Real, _share, float)]
+    twist: Annotated[Float[np.ndarray, "N 3"], _newer(_THREE, _twist, float, shape=(3,), slack=1)]
 
     @cached_property
     def times_s(self) -> Float[np.ndarray, " N"]:
