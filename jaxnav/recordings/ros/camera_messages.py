@@ -1,4 +1,4 @@
-"""Conversion of ROS messages of cameras into corners and images.
+"""Convert ROS messages of cameras to corners and images.
 
     apriltag_msgs/AprilTagDetectionArray   apriltag_ros 2: pixels counted from the image's edge
     apriltag_msgs/ApriltagArrayStamped     TagSLAM: pixels as its calibration counts them

@@ -8,6 +8,8 @@ clock, and missing ones, say nothing: there the time is that of arrival.
 import time
 from collections.abc import Callable
 
+from jaxnav.recordings.ros import time_ns
+
 _OLDEST_NS = 1_000_000_000  # a message that claims to be older was stamped by another clock
 _BELIEVED_AFTER = 10  # messages in a row with stamps of this clock, after others
 _STEP_NS = 2_000_000  # ROS's clock was set anew, or has drifted off the monotonic one
@@ -43,7 +45,7 @@ class SourceClock:
 
     def time_ns(self, stamp: object) -> int:
         """The time of a message with this ROS stamp."""
-        stamped_ns = stamp_ns(stamp)
+        stamped_ns = time_ns(stamp)
         if self._offset is None:
             return stamped_ns
         now_ns = time.monotonic_ns()
@@ -58,8 +60,3 @@ class SourceClock:
         if not stamped_ns or stamped_ns != self._last[0]:
             self._last = stamped_ns, now_ns
         return self._last[1]
-
-
-def stamp_ns(stamp: object) -> int:
-    """A ROS stamp as ns."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)  # type: ignore[attr-defined]
