@@ -2,7 +2,6 @@
 
 import time
 from dataclasses import replace
-from types import SimpleNamespace as Named
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +14,10 @@ from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.detection.types import Detections
-from jaxnav.files.poses import compose, inverse
 from jaxnav.recordings.ros.body import BodyTracker
 from jaxnav.recordings.ros.estimates import base_pose_covariance, base_twist
 from jaxnav.recordings.ros.odometry_track import GrowingTrack
-from jaxnav.vehicles.ros.odom_frame import IDENTITY, OdomPose
+from jaxnav.vehicles.ros.odom_frame import IDENTITY
 from tests import worlds
 
 TIMES_S = np.arange(0.0, 1.5, 0.1)
@@ -174,31 +172,3 @@ def test_a_stamp_of_another_year_does_not_end_it(navigator, frames, stepped):
     assert alone.outcomes[-1].now_ns < 2_000_000_000
     assert alone.tracker._odometry.reaches(1_500_000_000)
     assert not alone.tracker._odometry.reaches(2**60)
-
-
-def test_an_odometry_s_body_elsewhere_on_the_rig_is_taken_for_it():
-    """A nav_msgs/Odometry tells pose and twist of its own body."""
-    here, T_odom_vehicle = np.asarray(T_VEHICLE_SENSOR.wxyz_xyz), T_MAP_ODOM
-    pose = np.asarray((T_odom_vehicle @ T_VEHICLE_SENSOR).wxyz_xyz).tolist()
-    twist = np.asarray(T_VEHICLE_SENSOR.inverse().adjoint() @ TWIST).tolist()
-    message = Named(
-        pose=Named(
-            pose=Named(
-                position=Named(**dict(zip("xyz", pose[4:], strict=True))),
-                orientation=Named(**dict(zip("wxyz", pose[:4], strict=True))),
-            )
-        ),
-        twist=Named(
-            twist=Named(
-                linear=Named(**dict(zip("xyz", twist[:3], strict=True))),
-                angular=Named(**dict(zip("xyz", twist[3:], strict=True))),
-            )
-        ),
-    )
-    odom = OdomPose(here)
-    odom.add(0, message)
-    for late_s in (0.0, 0.1):
-        expected = np.asarray((T_odom_vehicle @ jaxlie.SE3.exp(TWIST * late_s)).wxyz_xyz)
-        away = compose(inverse(odom.at(round(late_s * 1e9))), expected)
-        # The way is taken along the turn's middle.
-        assert np.linalg.norm(away[1:]) < 2e-5

@@ -1,7 +1,5 @@
 """What ROS is told of an estimate, against samples that are moved one by one."""
 
-from types import SimpleNamespace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,10 +12,8 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.pilot import Outcome
-from jaxnav.files.poses import compose, inverse, matrix
 from jaxnav.recordings.ros.estimates import base_hypotheses, base_pose_covariance, base_twist
 from jaxnav.vehicles.conformance.lockstep import Step
-from jaxnav.vehicles.ros.odom_frame import OdomPose
 from tests.helpers.simulated import make_setup, simulated
 from tests.worlds import paper_markers, qcar_rig
 
@@ -114,38 +110,3 @@ def test_a_free_body_s_covariance_is_in_the_axes_of_the_map():
     close(pose_covariance, expected)
     (held,) = base_hypotheses(outcome, 0.0)[1]
     close(held, expected)
-
-
-class Message:
-    """A nav_msgs/Odometry of a pose (7,) wxyz_xyz and a twist (6,)."""
-
-    def __init__(self, pose: np.ndarray, twist: np.ndarray):
-        w, x, y, z, *xyz = pose.tolist()
-        orientation = SimpleNamespace(w=w, x=x, y=y, z=z)
-        position = SimpleNamespace(**dict(zip("xyz", xyz, strict=True)))
-        self.pose = SimpleNamespace(
-            pose=SimpleNamespace(position=position, orientation=orientation)
-        )
-        linear, angular = (
-            SimpleNamespace(**dict(zip("xyz", part.tolist(), strict=True)))
-            for part in (twist[:3], twist[3:])
-        )
-        self.twist = SimpleNamespace(twist=SimpleNamespace(linear=linear, angular=angular))
-
-
-def test_the_odometry_s_pose_is_carried_on_along_its_arc():
-    odom, start = OdomPose(), np.array([1.0, 0, 0, 0, 1.0, 2.0, 0])
-    assert odom.at(5) is None
-    odom.add(10**9, Message(start, np.array([0.5, 0, 0, 0, 0, 2.0])))
-    found = odom.at(10**9 + 100_000_000)
-    angle = 0.2
-    there = [1 + 0.25 * np.sin(angle), 2 + 0.25 * (1 - np.cos(angle)), 0]
-    # The chord is taken as long as the arc: 0.2 % off.
-    np.testing.assert_allclose(found[4:], there, atol=2e-4)
-    np.testing.assert_allclose(matrix(found)[:2, 0], [np.cos(angle), np.sin(angle)], atol=1e-12)
-    np.testing.assert_allclose(odom.at(0), start)  # never back in time
-    held = odom.at(10**9 + 200_000_000)
-    np.testing.assert_array_equal(odom.at(10**10), held)  # no further than it may be trusted
-    odom.add(2 * 10**9, Message(np.full(7, np.nan), np.zeros(6)))
-    np.testing.assert_array_equal(odom.at(10**10), held)
-    np.testing.assert_allclose(compose(inverse(held), held), [1, 0, 0, 0, 0, 0, 0], atol=1e-12)
