@@ -180,16 +180,10 @@ def bag_chunk(path: Path, kind: str = "bz2") -> Path:
     return path
 
 
-def _mcap(path: Path, topic: str, messages: list[dict[str, Any]], times: int = 1) -> Path:
-    """A recorded drive: a chunk with these messages, so many times."""
-    inner = RecordBuilder()
-    Schema(1, b"{}", "jsonschema", MESSAGES[topic][0]).write(inner)
-    Channel(1, topic, "json", {}, 1).write(inner)
-    for sequence, message in enumerate(messages):
-        Message(1, 0, json.dumps(message).encode(), 0, sequence).write(inner)
-    data = inner.end()
+def in_chunks(path: Path, chunk: Chunk, times: int = 1) -> Path:
+    """A recorded drive: one chunk again and again."""
     outer = RecordBuilder()
-    Chunk("zstd", zstandard.compress(data), 0, 0, 0, len(data)).write(outer)
+    chunk.write(outer)
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -199,18 +193,24 @@ def _mcap(path: Path, topic: str, messages: list[dict[str, Any]], times: int = 1
     return path
 
 
+def _packed(data: bytes) -> Chunk:
+    return Chunk("zstd", zstandard.compress(data), 0, 0, 0, len(data))
+
+
+def _mcap(path: Path, topic: str, messages: list[dict[str, Any]], times: int = 1) -> Path:
+    """A recorded drive: a chunk with these messages, so many times."""
+    inner = RecordBuilder()
+    Schema(1, b"{}", "jsonschema", MESSAGES[topic][0]).write(inner)
+    Channel(1, topic, "json", {}, 1).write(inner)
+    for sequence, message in enumerate(messages):
+        Message(1, 0, json.dumps(message).encode(), 0, sequence).write(inner)
+    return in_chunks(path, _packed(inner.end()), times)
+
+
 def mcap_zeros(path: Path) -> Path:
     """Thirty chunks of 60 MiB in 60 kB, of records that are none."""
     data = (b"\x7f" + struct.pack("<Q", 2**22 - 9) + bytes(2**22 - 9)) * 15
-    outer = RecordBuilder()
-    Chunk("zstd", zstandard.compress(data), 0, 0, 0, len(data)).write(outer)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("jaxnav.drive", header_metadata({}))
-        file.write(outer.end() * 30)
-        writer.finish()
-    return path
+    return in_chunks(path, _packed(data), 30)
 
 
 def mcap_ticks(path: Path) -> Path:

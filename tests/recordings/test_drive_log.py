@@ -1,6 +1,7 @@
 """A recorded drive is read back whole, up to a cut, or not at all, but never wrongly."""
 
 import dataclasses
+import functools
 import io
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
@@ -19,6 +19,7 @@ from jaxnav.recordings.drive_format import encode, header_metadata
 from jaxnav.recordings.drive_log import DriveLog, read_drive
 from jaxnav.recordings.recorder import Recorder
 from jaxnav.recordings.records import MESSAGES, input_message, json_schema
+from tests.helpers.bombs import in_chunks as in_chunks_of
 from tests.helpers.drives import (
     BEGIN_NS,
     OUTCOME,
@@ -334,19 +335,6 @@ def test_lz4_is_refused(tmp_path):
         read_drive(path)
 
 
-def _with_chunk(tmp_path: Path, chunk: Chunk) -> Path:
-    path = tmp_path / "bomb.mcap"
-    builder = RecordBuilder()
-    chunk.write(builder)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("jaxnav.drive", header_metadata({}))
-        file.write(builder.end())
-        writer.finish()
-    return path
-
-
 def test_a_file_cut_off_before_its_header_is_named(in_chunks, tmp_path):
     (tmp_path / "cut.mcap").write_bytes(in_chunks[:60])
     with pytest.raises(BadInput, match=r"cut.mcap: is cut off before its header"):
@@ -354,18 +342,22 @@ def test_a_file_cut_off_before_its_header_is_named(in_chunks, tmp_path):
 
 
 def test_what_grows_without_bounds_is_refused(tmp_path):
+    bomb = functools.partial(in_chunks_of, tmp_path / "bomb.mcap")
     large = zstandard.compress(bytes(65 * 2**20))
     chunk = Chunk("zstd", large, 0, 0, 0, 65 * 2**20)
     with pytest.raises(BadInput, match="a chunk of 68157440 bytes"):
-        read_drive(_with_chunk(tmp_path, chunk))
+        read_drive(bomb(chunk))
     with pytest.raises(BadInput, match="larger than it says"):
-        read_drive(_with_chunk(tmp_path, dataclasses.replace(chunk, uncompressed_size=1000)))
+        read_drive(bomb(dataclasses.replace(chunk, uncompressed_size=1000)))
     unsaid = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(65 * 2**20))
     with pytest.raises(BadInput, match="is damaged"):
         read_drive(
-            _with_chunk(tmp_path, dataclasses.replace(chunk, data=unsaid, uncompressed_size=1000))
+            in_chunks_of(
+                tmp_path / "bomb.mcap",
+                dataclasses.replace(chunk, data=unsaid, uncompressed_size=1000),
+            )
         )
-    path = _with_chunk(tmp_path, chunk)
+    path = bomb(chunk)
     header_ends = path.read_bytes().index(b"\x0c")
     path.write_bytes(path.read_bytes()[:header_ends] + b"\x0c" + (2**40).to_bytes(8, "little"))
     with pytest.raises(BadInput, match=r"is damaged .* exceeds limit"):
