@@ -36,7 +36,7 @@ def driven(setup: DriveSetup, seed: int) -> tuple[np.ndarray, np.ndarray, np.nda
         setup.rig, setup.markers, setup.vehicle, setup.route.start_pose, BEGIN_NS, seed=seed
     )
     steps = list(drive(setup.pilot(None), world, 8.0))
-    events = DriveEvents.of([step.input for step in steps], setup, Path("drive"))
+    events = DriveEvents.from_inputs([step.input for step in steps], setup, Path("drive"))
     filtered, smoothed = smooth_drive(events, setup)
     now_ns = [step.input.now_ns for step in steps]
     poses = np.array([step.truth[:3] for step in steps])

@@ -23,7 +23,7 @@ DRIVE = Path(__file__).resolve().parents[1] / "tests" / "data" / "drives" / "pla
 def main(path: str | Path = DRIVE, selector: str = "paper-cost") -> dict[str, float]:
     """Returns: how many inputs and frames with markers, and how far apart the poses are."""
     log = read_drive(path)
-    setup, recorded = DriveSetup.of_header(log.header, Path(path)), log.outcomes
+    setup, recorded = DriveSetup.from_header(log.header, Path(path)), log.outcomes
     odometry = [given.odometry for given in log.inputs if given.odometry]
     frames = [frame for given in log.inputs for frame in given.frames if frame.detections]
     speed_mps = max(reading.speed_mps for reading in odometry)

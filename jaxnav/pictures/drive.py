@@ -33,7 +33,7 @@ from jaxnav.pictures.localisation import (
 )
 from jaxnav.pictures.scenery import Scenery
 from jaxnav.recordings.drive_log import DriveLog
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 
 GREY, PURPLE = "#999999", "#CC79A7"
 # From pale to dark as health gets worse, so that it is readable in grey too.

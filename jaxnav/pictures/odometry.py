@@ -12,7 +12,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import SENSOR_ERRORS, Vehicle
 from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.recordings.learnt import Learnt
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 
 _POINTS = 400  # of a curve of what is learnt, at most
 _UNITS = {"steering_offset_rad": " (rad)", "camera_delay_s": " (s)"}

@@ -1,4 +1,4 @@
-"""New files of what a drive has learnt: its rig and its vehicle, corrected.
+"""Write rig and vehicle files corrected by what a drive has learnt.
 
 texts = adopted_files(setup, learnt, calibrated)     # {"rig.yaml": ..., "vehicle.yaml": ...}
 """
@@ -45,9 +45,9 @@ def adopted_files(
     if setup.rig.extrinsics_sigma is not None:
         texts["rig.yaml"] = rig_file_text(adopted_rig(rig or setup.rig, learnt), calibrated)
     if setup.vehicle.sensor_sigma is not None:
-        told = dict(zip(SENSOR_ERRORS, learnt.sensors_sigma.tolist(), strict=True))
+        sigma = dict(zip(SENSOR_ERRORS, learnt.sensors_sigma.tolist(), strict=True))
         adopted = adopted_vehicle(vehicle or setup.car(Path("DriveSetup")), learnt)
-        texts["vehicle.yaml"] = vehicle_file_text(adopted, calibrated, told)
+        texts["vehicle.yaml"] = vehicle_file_text(adopted, calibrated, sigma)
     return texts
 
 

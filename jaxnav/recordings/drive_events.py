@@ -1,4 +1,4 @@
-"""The events of a recorded drive, as a filter takes them: observations in the order of stamps.
+"""Turn a recorded drive into a filter's observations, in the order of their stamps.
 
 Inputs of a recorded drive are treated as the pilot treats them: the same stamps, frames and
 readings are believed, corrected as the vehicle's file says. But they are in the order of their
@@ -59,7 +59,7 @@ class DriveEvents:
         return len(self.stamps_ns)
 
     @staticmethod
-    def of(
+    def from_inputs(
         inputs: Sequence[Input],
         setup: DriveSetup,
         where: Path,
@@ -94,12 +94,8 @@ class DriveEvents:
 
 def refused_odometry(log: DriveLog) -> set[int]:
     """`now_ns` of the inputs whose odometry the pilot refused on the way."""
-    outcomes = log.outcomes
-    return {
-        int(now_ns)
-        for now_ns, rejects in zip(outcomes.now_ns, outcomes.rejects, strict=True)
-        if rejects & Reject.ODOMETRY
-    }
+    refused = log.outcomes.rejects & Reject.ODOMETRY != 0
+    return set(log.outcomes.now_ns[refused].tolist())
 
 
 def believed_events(
@@ -109,7 +105,10 @@ def believed_events(
 
     Sightings by several cameras at one instant are one event.
     """
-    events = sorted(_read_events(inputs, setup, refused_ns), key=_order)
+    events = sorted(
+        _read_events(inputs, setup, refused_ns),
+        key=lambda event: (event.stamp_ns, event.data.corners_px is None),  # corners first
+    )
     merged: list[Event] = []
     for event in events:
         if merged and (both := _both(merged[-1], event)):
@@ -145,21 +144,16 @@ def _mean_rates(
 ) -> Float[np.ndarray, " N"]:
     """What a gyro tells of the interval before each event, rad/s; NaN where it tells nothing."""
     track = GyroTrack(float(gyro.saturation_radps))
-    told = iter(given for given in inputs if given.gyro)
-    given = next(told, None)
+    of_gyro = iter(given for given in inputs if given.gyro)
+    given = next(of_gyro, None)
     rates = np.full(len(events), np.nan)
     for index, (before, event) in enumerate(pairwise(events), 1):
         # Readings are late by less than this, and the track is longer.
         while given is not None and given.now_ns <= event.stamp_ns + OLD_NS:
             track.take(given.gyro, given.now_ns)
-            given = next(told, None)
+            given = next(of_gyro, None)
         rates[index] = track.mean_radps(before.stamp_ns, event.stamp_ns)
     return rates
-
-
-def _order(event: Event) -> tuple[int, bool]:
-    """A sort key: by stamp, corners first."""
-    return event.stamp_ns, event.data.corners_px is None
 
 
 def _both(one: Event, other: Event) -> Event | None:
@@ -167,17 +161,17 @@ def _both(one: Event, other: Event) -> Event | None:
     a, b = one.data, other.data
     if one.stamp_ns != other.stamp_ns or a.visible is None or b.visible is None:
         return None
-    if np.any(np.any(a.visible, axis=1) & np.any(b.visible, axis=1)):
+    there = b.visible.any(axis=1)
+    if np.any(a.visible.any(axis=1) & there):
         return None
-    assert a.corners_px is not None
-    assert b.corners_px is not None
-    assert a.sigma_px is not None
-    assert b.sigma_px is not None
-    there = np.any(b.visible, axis=1)[:, None]
+
+    def joined(of_a: Any, of_b: Any) -> np.ndarray:
+        return np.where(there.reshape(-1, *[1] * (of_a.ndim - 1)), of_b, of_a)
+
     data = EventData(
-        corners_px=np.where(there[..., None, None], b.corners_px, a.corners_px),
+        corners_px=joined(a.corners_px, b.corners_px),
         visible=a.visible | b.visible,
-        sigma_px=np.where(there[..., None], b.sigma_px, a.sigma_px),
+        sigma_px=joined(a.sigma_px, b.sigma_px),
     )
     return Event(one.stamp_ns, data)
 

@@ -49,10 +49,13 @@ def decode(raw: bytes) -> dict[str, Any]:
     """
     try:
         message = from_json(raw, allow_inf_nan=False, cache_strings="keys")
-        if NOT_FINITE.encode() in raw:
-            message = _merged_below(message)
-    except ValueError:
-        message = _decode_slowly(raw)
+    except ValueError:  # Python's own reader takes half a surrogate pair, and says where errors are
+        try:
+            message = json.loads(raw, parse_constant=_refuse)
+        except RecursionError:
+            raise ValueError("it is nested too deep") from None
+    if NOT_FINITE.encode() in raw:
+        message = _merged(message)
     if not isinstance(message, dict):
         raise ValueError("it is not an object")
     return message
@@ -120,29 +123,17 @@ def _in_words(value: Any) -> Any:
     return value if _is_finite(value) else repr(float(value))
 
 
-def _merged(mapping: dict[str, Any]) -> dict[str, Any]:
-    if NOT_FINITE not in mapping:
-        return mapping
-    words = mapping.pop(NOT_FINITE)
+def _merged(value: Any) -> Any:
+    """Plain values with what is not finite among the others again."""
+    if isinstance(value, list) and not _PARTS.isdisjoint(map(type, value)):
+        return [_merged(one) for one in value]
+    if not isinstance(value, dict):
+        return value
+    mapping = {key: _merged(inner) for key, inner in value.items()}
+    words = mapping.pop(NOT_FINITE, {})
     if not isinstance(words, dict) or words.keys() & mapping.keys():
         raise ValueError(f"{NOT_FINITE} must be an object of other keys")
-    return mapping | {key: _in_numbers(value) for key, value in words.items()}
-
-
-def _merged_below(value: Any) -> Any:
-    if isinstance(value, list) and not _PARTS.isdisjoint(map(type, value)):
-        return [_merged_below(one) for one in value]
-    if isinstance(value, dict):
-        return _merged({key: _merged_below(inner) for key, inner in value.items()})
-    return value
-
-
-def _decode_slowly(raw: bytes) -> Any:
-    """Decode by Python's own reader: it takes other encodings too, and says where an error is."""
-    try:
-        return _merged_below(_PYTHON.decode(raw.decode(json.detect_encoding(raw), "surrogatepass")))
-    except RecursionError:
-        raise ValueError("it is nested too deep") from None
+    return mapping | {key: _in_numbers(word) for key, word in words.items()}
 
 
 def _in_numbers(value: Any) -> Any:
@@ -153,6 +144,3 @@ def _in_numbers(value: Any) -> Any:
 
 def _refuse(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is no JSON")
-
-
-_PYTHON = json.JSONDecoder(parse_constant=_refuse)

@@ -1,7 +1,7 @@
 """Replay a recorded drive: run its inputs again, and find where the outcomes differ.
 
     log = read_drive(path)
-    setup = DriveSetup.of_header(log.header, path)
+    setup = DriveSetup.from_header(log.header, path)
     difference = first_difference(log, replay_drive(log.inputs, setup, folder))
 
 On the machine and with the versions of the recording every bit is the same, elsewhere every number
@@ -29,8 +29,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files.images import decode_image
 from jaxnav.recordings.drive_log import DriveLog, RecordedImage
 from jaxnav.recordings.drive_setup import DriveSetup, made_here
-from jaxnav.recordings.messages import digest
-from jaxnav.recordings.outcomes import COLUMNS, Outcomes
+from jaxnav.recordings.records import COLUMNS, Outcomes, digest
 
 # Rounding differences between machines, relative to values above 1.
 TOLERANCE_FLOAT64, TOLERANCE_FLOAT32 = 1e-9, 1e-3
@@ -137,7 +136,7 @@ def first_difference(log: DriveLog, outcomes: Iterable[Outcome]) -> Difference |
 
 def _difference(recorded: Outcomes, index: int, outcome: Outcome, tolerance: float) -> str | None:
     def pair(name: str) -> tuple[Any, Any]:
-        return getattr(recorded, name)[index], COLUMNS[name].compared(outcome)
+        return getattr(recorded, name)[index], COLUMNS[name].row(outcome)
 
     for name in _EXACT:
         before, now = pair(name)

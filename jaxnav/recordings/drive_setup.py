@@ -1,11 +1,11 @@
-"""The setup of a drive: all that a replay needs to compute the same bits.
+"""Everything that a replay needs to compute the same bits as the drive.
 
     setup = DriveSetup(rig, markers, vehicle, route)
     pilot = setup.pilot(folder)
     recorder = Recorder(path, setup.header())
 
     log = read_drive(path)
-    setup = DriveSetup.of_header(log.header, path)
+    setup = DriveSetup.from_header(log.header, path)
 
 The header is plain JSON and holds rig, markers, vehicle and parameters in the form of their files.
 """
@@ -51,7 +51,7 @@ from jaxnav.files.validation import (
     validate,
 )
 from jaxnav.files.vehicles import VehicleFile, as_car, is_base_file, vehicle_data
-from jaxnav.recordings.message_fields import Flag
+from jaxnav.recordings.records import Flag
 
 SETUP_VERSION = 1
 # Folders of sources on which the bits of a drive don't depend.
@@ -240,7 +240,7 @@ class DriveSetup:
         return header | {name: False for name, value in others.items() if not value}
 
     @staticmethod
-    def of_header(header: dict[str, Any], where: Path) -> "DriveSetup":
+    def from_header(header: dict[str, Any], where: Path) -> "DriveSetup":
         """The setup of a `header`. The process must have its precision, see `needs_float64`.
 
         Args:
@@ -272,7 +272,7 @@ def needs_float64(header: dict[str, Any], where: Path) -> bool:
     """Whether a recorded drive needs float64; makes no array.
 
     Raises:
-        BadInput: as `DriveSetup.of_header`.
+        BadInput: as `DriveSetup.from_header`.
     """
     return _checked(header, where).float64
 

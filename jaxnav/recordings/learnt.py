@@ -1,4 +1,4 @@
-"""The errors of a vehicle's sensors and cameras that its bank has learnt, in a file's units."""
+"""What a drive has learnt of the errors of its sensors and cameras, in the units of their files."""
 
 from dataclasses import dataclass
 
@@ -94,7 +94,7 @@ class Learnt:
     sensor_names: tuple[str, ...] = SENSOR_ERRORS
 
     @staticmethod
-    def of(
+    def from_errors(
         errors: Float[np.ndarray, " e"],
         sigma: Float[np.ndarray, " e"],
         rig: CameraRig,
@@ -119,7 +119,7 @@ class Learnt:
         return Learnt(*of_sensors, turns, turns_sigma, prior, rig, sensor_errors(vehicle))
 
     def sentences(self) -> list[str]:
-        """An error a line, of those that the drive has told apart from none."""
+        """One line for each error that is clearly not zero."""
         return list(self.found().values())
 
     def found(self) -> dict[tuple[str, str], str]:
@@ -136,15 +136,15 @@ class Learnt:
                 if _is_learnt(turns[axis], sigmas[axis], priors[axis]):
                     turn_deg, sigma_deg = np.rad2deg([abs(turns[axis]), sigmas[axis]])
                     name, does = self.rig.names[camera], words[int(turns[axis] < 0)]
-                    told = does.format(f"{turn_deg:.2f} deg")
-                    told = f"camera {name} {told} (sigma {sigma_deg:.2f})"
-                    sentences[name, does] = told + _contradiction(turns[axis], priors[axis])
+                    turned = does.format(f"{turn_deg:.2f} deg")
+                    text = f"camera {name} {turned} (sigma {sigma_deg:.2f})"
+                    sentences[name, does] = text + _contradiction(turns[axis], priors[axis])
         of_sensors = self.sensors, self.sensors_sigma, self.sensors_prior
         rows = zip(self.sensor_names, *of_sensors, strict=True)
         for name, value, sigma, prior in rows:
             if _is_learnt(value, sigma, prior):
-                told = f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"
-                sentences["sensors", name] = told + _contradiction(value, prior)
+                text = f"{name} is off by {value:+.4f} (sigma {sigma:.4f})"
+                sentences["sensors", name] = text + _contradiction(value, prior)
         return sentences
 
 

@@ -1,13 +1,12 @@
 """Record a drive to a file without ever holding up the drive.
 
     recorder = Recorder(path, header)
-    recorder.put(*input_message(given))
-    recorder.put(OUTCOME, given.now_ns, outcome_message(outcome))
+    recorder.record(given, outcome)
     recorder.image("/camera/front", stamp_ns, pixels)
     recorder.close()
 
-The file is MCAP with JSON messages (see `message_schemas`). However the program ends, the file can
-be read up to the last half second.
+The file is MCAP with JSON messages (see `records`). However the program ends, the file can be read
+up to the last half second.
 """
 
 import base64
@@ -17,18 +16,28 @@ import secrets
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, Any, NamedTuple, cast
 
 import cv2
 import numpy as np
 from mcap.writer import Writer
 
+from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import BadInput
 from jaxnav.recordings.drive_format import HEADER, PROFILE, encode, header_metadata
-from jaxnav.recordings.message_schemas import IMAGE_SCHEMA, MESSAGES, ImageMessage, json_schema
+from jaxnav.recordings.records import (
+    IMAGE_SCHEMA,
+    MESSAGES,
+    OUTCOME,
+    ImageMessage,
+    input_message,
+    json_schema,
+    outcome_message,
+)
 
 IDLE_S = 0.02  # period of looks at an empty queue
 FLUSH_S = 0.25  # the longest time until a message is handed to the operating system
@@ -37,18 +46,19 @@ JPEG_QUALITY = 85
 _MAX_TIME_NS = 2**64 - 1
 
 
-@dataclass(frozen=True)
-class _Item:
+_Message = dict[str, Any]
+
+
+class _Item(NamedTuple):
     topic: str
     stamp_ns: int
-    log_ns: int
     sequence: int
-    content: Any
+    message: Callable[[], _Message]
     is_image: bool
 
 
 class Recorder:
-    """A file and a thread that writes it. Any thread may call `put` and `image`.
+    """A file and a thread that writes it. Any thread may record.
 
     Messages that do not fit into the queue are dropped and counted; a gap in the sequence numbers
     of their topic shows where. Images are dropped first.
@@ -103,14 +113,25 @@ class Recorder:
         self._thread = threading.Thread(target=self._run, name="jaxnav-recorder", daemon=True)
         self._thread.start()
 
-    def put(self, topic: str, stamp_ns: int, message: dict[str, Any]) -> None:
+    def record(self, given: Input, outcome: Outcome) -> None:
+        """Record an input and what the pilot made of it. Never waits, never raises.
+
+        Args:
+            given, outcome: their arrays must not be changed afterwards.
+        """
+        self.put(*input_message(given))
+        self.put(OUTCOME, given.now_ns, partial(outcome_message, outcome))
+
+    def put(self, topic: str, stamp_ns: int, message: _Message | Callable[[], _Message]) -> None:
         """Record a message. Never waits, never raises.
 
         Args:
             stamp_ns: its timestamp. Its `now_ns`, if it has one, is the time of handling.
-            message: as `encode` takes it; must not be changed afterwards.
+            message: as `encode` takes it, or what makes it in the recorder's thread; must not be
+                changed afterwards.
         """
-        self._offer(topic, stamp_ns, message.get("now_ns", stamp_ns), message, is_image=False)
+        make = message if callable(message) else lambda: message
+        self._offer(topic, stamp_ns, make, is_image=False)
 
     def image(self, topic: str, stamp_ns: int, image: bytes | np.ndarray) -> None:
         """Record an image. Never waits, never raises.
@@ -119,7 +140,7 @@ class Recorder:
             topic: its last part is the camera's name.
             image: a JPEG, or (H, W) or (H, W, 3) BGR pixels; must not be changed afterwards.
         """
-        self._offer(topic, stamp_ns, stamp_ns, image, is_image=True)
+        self._offer(topic, stamp_ns, partial(_image_message, topic, stamp_ns, image), is_image=True)
 
     def close(self, timeout_s: float = 5.0, keep_empty: bool = True) -> None:
         """Write the queue and the summary. May be called any number of times. If the disk does not
@@ -135,7 +156,9 @@ class Recorder:
         if self._thread.is_alive() and self.failed is None:
             self.failed = f"{self.path}: the disk does not answer"
 
-    def _offer(self, topic: str, stamp_ns: int, log_ns: int, content: Any, is_image: bool) -> None:
+    def _offer(
+        self, topic: str, stamp_ns: int, message: Callable[[], _Message], is_image: bool
+    ) -> None:
         with self._lock:
             sequence = self._sequences.get(topic, 0)
             self._sequences[topic] = sequence + 1
@@ -147,20 +170,16 @@ class Recorder:
                 self.dropped += 1
                 return
             self._images += is_image
-            self._queue.append(_Item(topic, stamp_ns, log_ns, sequence, content, is_image))
-
-    def _take(self) -> _Item | None:
-        with self._lock:
-            if not self._queue:
-                return None
-            item = self._queue.popleft()
-            self._images -= item.is_image
-            return item
+            self._queue.append(_Item(topic, stamp_ns, sequence, message, is_image))
 
     def _run(self) -> None:
         try:
             while True:
-                item = self._take()
+                item = None
+                with self._lock:
+                    if self._queue:
+                        item = self._queue.popleft()
+                        self._images -= item.is_image
                 if item is not None:
                     self._write(item)
                     time.sleep(0)  # lets the driving thread have the interpreter
@@ -172,14 +191,19 @@ class Recorder:
             if self._keeps_empty:
                 self._file.take_place(only_where_free=True)
         except Exception as error:  # from the disk or anything else: the vehicle drives on
-            self._fail(error)
+            with self._lock:
+                self.failed = f"{self.path}: can't be written: {_reason(error)}"
+                self.dropped += len(self._queue)
+                self._queue.clear()
         with suppress(OSError):
             self._file.leave()
 
     def _write(self, item: _Item) -> None:
         try:
-            raw = encode(_image_message(item) if item.is_image else item.content)
-            log_ns, stamp_ns = _time(item.log_ns), _time(item.stamp_ns)
+            message = item.message()
+            raw = encode(message)
+            log_ns = _time(message.get("now_ns", item.stamp_ns))
+            stamp_ns = _time(item.stamp_ns)
         except Exception:  # a message that can't be written must not end the recording
             with self._lock:
                 self.dropped += 1
@@ -207,12 +231,6 @@ class Recorder:
         if now_s - self._synced_s >= SYNC_S:
             self._file.sync()
             self._synced_s = now_s
-
-    def _fail(self, error: Exception) -> None:
-        with self._lock:
-            self.failed = f"{self.path}: can't be written: {_reason(error)}"
-            self.dropped += len(self._queue)
-            self._queue.clear()
 
 
 class _File:
@@ -267,18 +285,17 @@ class _File:
             self._beside.unlink(missing_ok=True)
 
 
-def _image_message(item: _Item) -> dict[str, Any]:
-    jpeg = item.content
-    if not isinstance(jpeg, bytes):
-        done, encoded = cv2.imencode(".jpg", jpeg, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+def _image_message(topic: str, stamp_ns: int, image: bytes | np.ndarray) -> _Message:
+    if not isinstance(image, bytes):
+        done, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
             raise ValueError("no image")
-        jpeg = encoded.tobytes()
-    seconds, nanoseconds = divmod(max(item.stamp_ns, 0), 10**9)
+        image = encoded.tobytes()
+    seconds, nanoseconds = divmod(max(stamp_ns, 0), 10**9)
     return {
         "timestamp": {"sec": seconds, "nsec": nanoseconds},
-        "frame_id": item.topic.removeprefix("/camera/"),
-        "data": base64.b64encode(jpeg).decode(),
+        "frame_id": topic.removeprefix("/camera/"),
+        "data": base64.b64encode(image).decode(),
         "format": "jpeg",
     }
 

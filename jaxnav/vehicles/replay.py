@@ -242,7 +242,7 @@ def _recorded(options: Mapping[str, str]) -> tuple[DriveLog, DriveSetup]:
     with contextlib.suppress(OSError):
         written_ns = path.stat().st_mtime_ns
     log = _read(path, written_ns)
-    own = DriveSetup.of_header(log.header, path)
+    own = DriveSetup.from_header(log.header, path)
     if not log.inputs:
         raise BadInput(path, "holds no input")
     check_inputs(log.inputs, own, path)

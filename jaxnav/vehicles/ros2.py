@@ -101,7 +101,7 @@ class RosVehicle:
         self._topic = options.get("odometry_topic", "/odom")
         self._reading: Reading | None = None
         self._turns: deque[GyroReading] = deque(maxlen=MOST_TURNS)
-        self._told = self._limits.zero
+        self._sent = self._limits.zero
         self._written_ns: int | None = None
         self._closed = False
         self._writing = threading.Lock()  # so that no command follows the zero speed of a `stop`
@@ -157,14 +157,14 @@ class RosVehicle:
                 raise OSError("the ROS vehicle is closed")
             now_ns = time.monotonic_ns()
             before_ns = now_ns if self._written_ns is None else self._written_ns
-            self._told = self._limits.within(command, self._told, (now_ns - before_ns) / 1e9)
+            self._sent = self._limits.within(command, self._sent, (now_ns - before_ns) / 1e9)
             self._written_ns = now_ns
             stops = self._stops
             try:
-                self._command(self._told)
+                self._command(self._sent)
             finally:
                 if self._stops != stops:  # a stop did not wait for this command, which hung
-                    self._command(self._limits.standing(self._told))
+                    self._command(self._limits.standing(self._sent))
 
     def stop(self) -> None:
         """Publish speed zero, also while ROS hangs with another message.
@@ -176,7 +176,7 @@ class RosVehicle:
         free = self._writing.acquire(timeout=_LOCK_PATIENCE_S)
         try:
             if not self._closed:
-                self._command(self._limits.standing(self._told))
+                self._command(self._limits.standing(self._sent))
         finally:
             if free:
                 self._writing.release()

@@ -196,5 +196,5 @@ def test_a_recorded_drive_keeps_the_calibration_and_an_old_one_has_none():
     assert "speed_scale" not in setup.header()["vehicle"]
     header = dataclasses.replace(setup, vehicle=vehicle()).header()
     assert header["vehicle"]["camera_delay_s"] == 0.035
-    read = DriveSetup.of_header(header, HERE).vehicle
+    read = DriveSetup.from_header(header, HERE).vehicle
     assert Corrections.of(read) == Corrections.of(vehicle())

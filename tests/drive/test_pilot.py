@@ -19,7 +19,7 @@ from jaxnav.drive.history import EventData
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input, Outcome, Pilot
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import digest
+from jaxnav.recordings.records import digest
 from jaxnav.vehicles.conformance import injections as inject
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Rates, Step
 from tests import worlds

@@ -15,7 +15,7 @@ from jaxnav.files import Route
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_replay import first_difference, replay_drive
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import digest
+from jaxnav.recordings.records import digest
 from jaxnav.sim.bases import equipped
 from jaxnav.vehicles.conformance import injections as inject
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Step, drive
@@ -99,7 +99,7 @@ def test_the_recorded_drive_replays_to_the_same_states(setup, steps, tmp_path):
     log = read_drive(path)
     assert [given.gyro for given in log.inputs] == [step.input.gyro for step in steps]
     assert [given.odometry for given in log.inputs] == [step.input.odometry for step in steps]
-    again = DriveSetup.of_header(log.header, path)
+    again = DriveSetup.from_header(log.header, path)
     assert isinstance(again.vehicle, TwistBase)
     outcomes = list(replay_drive(log.inputs, again, None))
     assert first_difference(log, outcomes) is None

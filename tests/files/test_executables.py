@@ -117,7 +117,7 @@ def test_the_digest_is_of_all_that_a_program_or_a_drive_depends_on(tmp_path):
         ("core/linalg/small_matrices.py", True, True),
         ("vehicles/sim.py", True, False),
         ("vehicles/conformance/matrix.py", False, False),
-        ("recordings/messages.py", True, True),
+        ("recordings/records.py", True, True),
         ("recordings/other/tagslam.py", False, False),
         ("commands/drive/run.py", False, False),
     ]:

@@ -31,10 +31,8 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.recordings.drive_format import HEADER, PROFILE, encode
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.message_schemas import MESSAGES, OUTCOME
-from jaxnav.recordings.messages import input_message
 from jaxnav.recordings.other.recordings import Recording
-from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.records import MESSAGES, OUTCOME, input_message, outcome_message
 from jaxnav.vehicles import replay
 from jaxnav.vehicles.options import number, whole_number
 from tests.helpers.drives import make_input, make_outcome
@@ -190,7 +188,7 @@ def used_drive(path: Path) -> None:
     """All that the commands make of a drive before they drive or draw it."""
     replay._read.cache_clear()  # two files may be written in one tick of the disk's clock
     log = read_drive(path)
-    setup = DriveSetup.of_header(log.header, path)
+    setup = DriveSetup.from_header(log.header, path)
     assert_sound((setup.rig, setup.markers, setup.vehicle))
     if len(log.outcomes.now_ns):
         assert all(isinstance(line, str) for line in summary_lines(log))

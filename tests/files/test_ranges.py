@@ -19,8 +19,7 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import validate
 from jaxnav.recordings.drive_format import decode, encode
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.message_schemas import MESSAGES
-from jaxnav.recordings.messages import input_message, input_of
+from jaxnav.recordings.records import MESSAGES, input_message
 from tests.helpers.drives import make_detections
 from tests.helpers.loader_seeds import BINARY, STRUCTURED
 from tests.helpers.simulated import make_setup
@@ -113,7 +112,7 @@ def test_so_it_is_in_the_header_of_a_drive(keys, odd):
         put(header, keys, value)
         named = keys[-1] if len(keys) < 3 and isinstance(keys[-1], str) else keys[0]
         with pytest.raises(BadInput, match=rf"drive.mcap: header.*{named}"):
-            DriveSetup.of_header(header, Path("drive.mcap"))
+            DriveSetup.from_header(header, Path("drive.mcap"))
 
 
 @pytest.mark.parametrize(
@@ -185,7 +184,7 @@ def test_a_stamp_that_no_clock_can_say_is_recorded_as_one_that_nobody_believes()
         given = Input(5, Odometry(stamp_ns, 0.0, 0.0))
         topic, _, message = input_message(given)
         model: type[BaseModel] = MESSAGES[topic][1]
-        back = input_of(validate(model, decode(encode(message)), Path("a.mcap")))
+        back = validate(model, decode(encode(message)), Path("a.mcap")).input()
         assert abs(back.odometry.stamp_ns) == MOST_NS
         live, again = Stamps(), Stamps()
         for now_ns in range(10**9, 2 * 10**9, 10**7):

@@ -18,9 +18,8 @@ from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.recordings.drive_format import HEADER, PROFILE, encode, header_of
-from jaxnav.recordings.mcap_messages import McapMessages, RecordedMessage
-from jaxnav.recordings.message_schemas import MESSAGES
-from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.drive_log import McapMessages, RecordedMessage
+from jaxnav.recordings.records import MESSAGES, input_message
 from tests.helpers import loader_seeds as loaders
 from tests.helpers.odometry_drives import RECIPE, START, sensed, true_track
 from tests.helpers.ros_drives import TOPICS

@@ -20,7 +20,8 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import Writer
 
 from jaxnav.recordings.drive_format import header_metadata
-from jaxnav.recordings.message_schemas import MESSAGES
+from jaxnav.recordings.records import MESSAGES
+from tests.helpers.drives import OUTCOME, REPORTED
 
 GIB = 2**30
 HUGE_PX = 30_000  # OpenCV itself refuses more than 2**30 pixels
@@ -179,16 +180,10 @@ def bag_chunk(path: Path, kind: str = "bz2") -> Path:
     return path
 
 
-def _mcap(path: Path, topic: str, messages: list[dict[str, Any]], times: int = 1) -> Path:
-    """A recorded drive: a chunk with these messages, so many times."""
-    inner = RecordBuilder()
-    Schema(1, b"{}", "jsonschema", MESSAGES[topic][0]).write(inner)
-    Channel(1, topic, "json", {}, 1).write(inner)
-    for sequence, message in enumerate(messages):
-        Message(1, 0, json.dumps(message).encode(), 0, sequence).write(inner)
-    data = inner.end()
+def in_chunks(path: Path, chunk: Chunk, times: int = 1) -> Path:
+    """A recorded drive: one chunk again and again."""
     outer = RecordBuilder()
-    Chunk("zstd", zstandard.compress(data), 0, 0, 0, len(data)).write(outer)
+    chunk.write(outer)
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -198,18 +193,24 @@ def _mcap(path: Path, topic: str, messages: list[dict[str, Any]], times: int = 1
     return path
 
 
+def _packed(data: bytes) -> Chunk:
+    return Chunk("zstd", zstandard.compress(data), 0, 0, 0, len(data))
+
+
+def _mcap(path: Path, topic: str, messages: list[dict[str, Any]], times: int = 1) -> Path:
+    """A recorded drive: a chunk with these messages, so many times."""
+    inner = RecordBuilder()
+    Schema(1, b"{}", "jsonschema", MESSAGES[topic][0]).write(inner)
+    Channel(1, topic, "json", {}, 1).write(inner)
+    for sequence, message in enumerate(messages):
+        Message(1, 0, json.dumps(message).encode(), 0, sequence).write(inner)
+    return in_chunks(path, _packed(inner.end()), times)
+
+
 def mcap_zeros(path: Path) -> Path:
     """Thirty chunks of 60 MiB in 60 kB, of records that are none."""
     data = (b"\x7f" + struct.pack("<Q", 2**22 - 9) + bytes(2**22 - 9)) * 15
-    outer = RecordBuilder()
-    Chunk("zstd", zstandard.compress(data), 0, 0, 0, len(data)).write(outer)
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_metadata("jaxnav.drive", header_metadata({}))
-        file.write(outer.end() * 30)
-        writer.finish()
-    return path
+    return in_chunks(path, _packed(data), 30)
 
 
 def mcap_ticks(path: Path) -> Path:
@@ -230,16 +231,8 @@ def mcap_detections(path: Path) -> Path:
 
 def mcap_covariance(path: Path) -> Path:
     """One covariance of 500 x 500, and a table that would have a row of it for each outcome."""
-    plain = {
-        "now_ns": 1, "health": "OK", "faults": [], "rejects": [], "steering_rad": 0.0,
-        "throttle": 0.0, "restarts": 0, "reason": "", "digest": "",
-    }  # fmt: skip
-    told = {
-        "pose": [0.0] * 3, "covariance": [1.0] * 250_000, "flip_probability": 0.0, "nis": 0.0,
-        "hypothesis": 0, "hypotheses": [0.0] * 3, "log_weight": [0.0], "selected": -1,
-        "Ts_vehicle_world": [0.0] * 7, "costs": [0.0],
-    }  # fmt: skip
-    return _mcap(path, "/outcome", [plain | told, *[plain] * 3000])
+    whole = OUTCOME | REPORTED | {"covariance": [1.0] * 250_000}
+    return _mcap(path, "/outcome", [whole, *[OUTCOME] * 3000])
 
 
 PICTURES: dict[str, Callable[[Path], Path]] = {

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,11 +20,34 @@ from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import GyroReading, Odometry, TwistOdometry
 from jaxnav.drive.pilot import Input, Outcome
-from jaxnav.recordings.messages import input_message
-from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.records import input_message, outcome_message
 
 BEGIN_NS = 5_000_000_123
 PERIOD_NS = 10_000_000
+# Messages of an outcome without a report, and what a report adds.
+OUTCOME: dict[str, Any] = {
+    "now_ns": 1,
+    "health": "OK",
+    "faults": [],
+    "rejects": [],
+    "steering_rad": 0.0,
+    "throttle": 0.0,
+    "restarts": 0,
+    "reason": "",
+    "digest": "",
+}
+REPORTED: dict[str, Any] = {
+    "pose": [0.0] * 3,
+    "covariance": [0.0] * 9,
+    "flip_probability": 0.0,
+    "nis": 0.0,
+    "hypothesis": 0,
+    "hypotheses": [],
+    "log_weight": [],
+    "Ts_vehicle_world": [],
+    "costs": [],
+    "selected": -1,
+}
 
 
 def make_detections(rng: np.random.Generator, count: int) -> Detections:

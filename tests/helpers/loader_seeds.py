@@ -30,11 +30,10 @@ from jaxnav.files.ros import load_ros
 from jaxnav.files.wpilib import layout_figures, layout_left_out
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import input_message
 from jaxnav.recordings.other.recordings import read_recording
-from jaxnav.recordings.other.ros_drives import read_ros_drive
-from jaxnav.recordings.outcomes import outcome_message
+from jaxnav.recordings.other.ros import read_ros_drive
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message, outcome_message
 from jaxnav.sim.bases import equipped
 from tests.helpers.drives import make_base_input, make_outcome, record_drive
 from tests.helpers.ros_bags import FORMATS, Bag
@@ -190,7 +189,7 @@ def _base_drive(folder: Path) -> Path:
 def _whole_drive(path: Path) -> Any:
     """All that a command reads of it."""
     log = read_drive(path)
-    return log, DriveSetup.of_header(log.header, path), list(log.images())
+    return log, DriveSetup.from_header(log.header, path), list(log.images())
 
 
 STORED = ("zarr.json", "done/zarr.json", "done/c/0/0", "outcome/zarr.json", "outcome/c/0/0/0")

@@ -1,5 +1,6 @@
 """ROS 1 and ROS 2 bags with the messages that a drive may hold, written by rosbags."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ APRILTAGS = "apriltag_msgs/msg/AprilTagDetectionArray"
 TAGSLAM = "apriltag_msgs/msg/ApriltagArrayStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDriveStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
+TF = "tf2_msgs/msg/TFMessage"
 IMU = "sensor_msgs/msg/Imu"
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -29,7 +31,7 @@ _DEFINITIONS = {
     APRILTAGS: "std_msgs/Header header\nAprilTagDetection[] detections\n",
     "apriltag_msgs/msg/Apriltag": (
         "int32 id\nstring family\nint32 hamming\nint32 border\nint32 bits\n"
-        "geometry_msgs/Point center\ngeometry_msgs/Point[4] corners\n"
+        "geometry_msgs/Point center\ngeometry_msgs/Point[] corners\n"
     ),
     TAGSLAM: "std_msgs/Header header\nApriltag[] apriltags\n",
     "ackermann_msgs/msg/AckermannDrive": (
@@ -37,6 +39,7 @@ _DEFINITIONS = {
         "float32 speed\nfloat32 acceleration\nfloat32 jerk\n"
     ),
     ACKERMANN: "std_msgs/Header header\nAckermannDrive drive\n",
+    TF: "geometry_msgs/TransformStamped[] transforms\n",
 }
 
 
@@ -119,28 +122,47 @@ class Bag:
         self.add(topic, TAGSLAM, received_ns, message)
 
     def odometry(
-        self, topic: str, received_ns: int, stamp_ns: int, speed_mps: float, yaw_radps: float
+        self,
+        topic: str,
+        received_ns: int,
+        stamp_ns: int,
+        speed_mps: float,
+        yaw_radps: float,
+        pose: Sequence[float] = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     ) -> None:
-        """A reading of speed and yaw rate."""
-        zero = self.make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-        pose = self.make(
+        """A reading of speed and yaw rate, and a pose wxyz xyz."""
+        w, x, y, z, *place_m = pose
+        placed = self.make(
             "geometry_msgs/Pose",
-            self.make("geometry_msgs/Point", 0.0, 0.0, 0.0),
-            self.make("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0),
+            self.make("geometry_msgs/Point", *place_m),
+            self.make("geometry_msgs/Quaternion", x, y, z, w),
         )
         twist = self.make(
             "geometry_msgs/Twist",
             self.make("geometry_msgs/Vector3", speed_mps, 0.0, 0.0),
-            self.make("geometry_msgs/Vector3", zero.x, zero.y, yaw_radps),
+            self.make("geometry_msgs/Vector3", 0.0, 0.0, yaw_radps),
         )
         message = self.make(
             "nav_msgs/Odometry",
             self.header(stamp_ns),
             "base_link",
-            self.make("geometry_msgs/PoseWithCovariance", pose, np.zeros(36)),
+            self.make("geometry_msgs/PoseWithCovariance", placed, np.zeros(36)),
             self.make("geometry_msgs/TwistWithCovariance", twist, np.zeros(36)),
         )
         self.add(topic, ODOMETRY, received_ns, message)
+
+    def transform(self, stamp_ns: int, parent: str, child: str, pose: Sequence[float]) -> None:
+        """A transform on /tf, its pose wxyz xyz."""
+        w, x, y, z, *place_m = pose
+        transform = self.make(
+            "geometry_msgs/Transform",
+            self.make("geometry_msgs/Vector3", *place_m),
+            self.make("geometry_msgs/Quaternion", x, y, z, w),
+        )
+        header = self.header(stamp_ns)
+        header.frame_id = parent
+        stamped = self.make("geometry_msgs/TransformStamped", header, child, transform)
+        self.add("/tf", TF, stamp_ns, self.make("tf2_msgs/TFMessage", [stamped]))
 
     def ackermann(
         self, topic: str, received_ns: int, stamp_ns: int, speed_mps: float, steering_rad: float

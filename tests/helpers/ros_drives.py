@@ -1,5 +1,6 @@
 """A small drive in a ROS bag, and how tests read one."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 
 from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import TopicMap, load_topics
-from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.other.ros import read_ros_drive
 from tests.helpers.ros_bags import Bag
 from tests.worlds import qcar, qcar_rig, room_markers
 
@@ -60,9 +63,15 @@ def topic_map(folder: Path, text: str) -> TopicMap:
     return load_topics(path)
 
 
+@functools.cache
+def _car() -> tuple[CameraRig, MarkerMap, Vehicle]:
+    return qcar_rig(), room_markers(), qcar()
+
+
 def read(path: Path, topics: TopicMap, markers: MarkerMap | None = None) -> list[Input]:
     """The inputs of a bag, with the QCar and its cameras."""
-    return read_ros_drive(path, topics, qcar_rig(), markers or room_markers(), qcar())
+    rig, room, car = _car()
+    return read_ros_drive(path, topics, rig, markers or room, car)
 
 
 def problem(*args: Any) -> str:

@@ -7,8 +7,6 @@ from typing import Any
 from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.files import Route
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import digest, input_message
-from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.recordings.recorder import Recorder
 from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Step, drive
@@ -34,8 +32,6 @@ def record(path: Path, header: dict[str, Any], told: Iterable[tuple[Input, Outco
     """What the loop records of a drive."""
     recorder = Recorder(path, header, queue_messages=100_000)
     for given, outcome in told:
-        recorder.put(*input_message(given))
-        message = outcome_message(outcome, digest(outcome))
-        recorder.put("/outcome", given.now_ns, message)
+        recorder.record(given, outcome)
     recorder.close(timeout_s=60)
     assert (recorder.dropped, recorder.failed) == (0, None)

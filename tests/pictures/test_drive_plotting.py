@@ -25,8 +25,8 @@ from jaxnav.files import calib_dir, load_markers, load_rig
 from jaxnav.pictures.drive import HEALTH_COLORS, drive_log_report
 from jaxnav.pictures.scenery import Scenery
 from jaxnav.recordings.drive_log import DriveLog, read_drive
-from jaxnav.recordings.messages import input_message
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message
 from tests.helpers.drives import record_drive
 from tests.pictures.test_plotting import rendered
 

@@ -29,7 +29,6 @@ from jaxnav.drive.interfaces import Odometry, Setup
 from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.recordings.ros import message_type
 from jaxnav.recordings.ros.camera_messages import APRILTAG_ROS, IMAGE, detections_message
-from jaxnav.recordings.ros.lenses import CAMERA_INFO
 from jaxnav.recordings.ros.odometry_messages import (
     ACKERMANN,
     IMU,
@@ -38,6 +37,7 @@ from jaxnav.recordings.ros.odometry_messages import (
 )
 from jaxnav.vehicles import sim
 from jaxnav.vehicles.ros.connection import Connection
+from jaxnav.vehicles.ros.lenses import CAMERA_INFO
 
 TF, POSE = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/Pose"
 TOPICS = {APRILTAG_ROS: "detections", IMAGE: "image_raw"}

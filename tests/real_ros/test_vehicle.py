@@ -183,7 +183,7 @@ def test_a_twist_is_that_of_the_rear_axle(peer):
     vehicle = open_vehicle(setup_with(command_type="twist", command_topic="/cmd_vel"))
     try:
         peer.listens(vehicle)
-        vehicle._told = STEERING_RAD, 0.0
+        vehicle._sent = STEERING_RAD, 0.0
         vehicle.write(STEERING_RAD, COURSE_MPS / SPEED_PER_THROTTLE_MPS)
         until(lambda: peer.heard, 20.0)
         twist = peer.heard[0]

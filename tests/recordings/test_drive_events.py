@@ -67,7 +67,7 @@ def test_a_base_s_drive_has_its_twist_and_its_gyro(tmp_path):
     log = read_drive(tmp_path / "d.mcap")
     are_what_the_pilot_fused(setup, log, [step.outcome for step in steps])
     events = believed_events(log.inputs, setup)
-    obs = DriveEvents.of(log.inputs, setup, log.path).obs
+    obs = DriveEvents.from_inputs(log.inputs, setup, log.path).obs
     told = np.array([event.data.odometry is not None for event in events])
     np.testing.assert_array_equal(obs.has_odometry, told)
     read = [event.data.odometry for event in events if event.data.odometry is not None]
@@ -107,7 +107,7 @@ def test_odometry_that_was_refused_is_left_out(setup, drive):
     told = dataclasses.replace(log, outcomes=dataclasses.replace(log.outcomes, rejects=rejects))
 
     def readings(inputs, refused_ns=()) -> int:
-        events = DriveEvents.of(inputs, setup, log.path, refused_ns)
+        events = DriveEvents.from_inputs(inputs, setup, log.path, refused_ns)
         return int(events.obs.has_odometry.sum())
 
     every, others = (readings(log.inputs, refused_odometry(x)) for x in (log, told))
@@ -139,4 +139,4 @@ def test_a_drive_that_shows_no_marker_is_refused(setup, drive):
     log, _ = drive
     blind = [dataclasses.replace(x, frames=()) for x in log.inputs]
     with pytest.raises(BadInput, match=r"drive\.mcap: .* none shows a marker of the map"):
-        DriveEvents.of(blind, setup, log.path)
+        DriveEvents.from_inputs(blind, setup, log.path)

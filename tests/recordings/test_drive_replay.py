@@ -26,9 +26,8 @@ from jaxnav.recordings.drive_replay import (
     replay_drive,
 )
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import input_message
-from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message, outcome_message
 from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS
 from tests.helpers.ros_bags import Bag
@@ -90,7 +89,7 @@ def outcomes(drive) -> list[Outcome]:
 
 def test_a_replay_has_the_recorded_bits(log, drive):
     path, told = drive
-    setup = DriveSetup.of_header(log.header, path)
+    setup = DriveSetup.from_header(log.header, path)
     again = list(replay_drive(log.inputs, setup, None))
     assert len(again) == len(told) > 100
     assert first_difference(log, again) is None

@@ -131,7 +131,7 @@ def test_a_setup_comes_back_bit_for_bit(double):
             relocate,
             drives,
         )
-        back = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
+        back = DriveSetup.from_header(decode(encode(setup.header())), WHERE)
         assert bits(back) == bits(setup)
 
     with jax.enable_x64(double):
@@ -144,7 +144,7 @@ def test_how_well_cameras_are_placed_comes_back():
     sigma[2] = 0
     rig = dataclasses.replace(worlds.qcar_rig(), extrinsics_sigma=jnp.asarray(sigma, float))
     setup = qcar_setup(rig=rig)
-    again = DriveSetup.of_header(decode(encode(setup.header())), WHERE)
+    again = DriveSetup.from_header(decode(encode(setup.header())), WHERE)
     np.testing.assert_array_equal(again.rig.extrinsics_sigma, sigma)
     assert bits(again) == bits(setup)
     assert bits(qcar_setup()) != bits(setup)
@@ -173,7 +173,7 @@ def test_parameters_reach_the_navigator_and_come_with_the_header():
     assert "parameters" not in setup.header()  # as older programs read it
     values = {"motion.odometry_sigma": [0.1, 0.2, 0.3], "selector.floor_m": 1e-3}
     tuned = setup.with_params(Params.of(values, WHERE))
-    back = DriveSetup.of_header(decode(encode(tuned.header())), WHERE)
+    back = DriveSetup.from_header(decode(encode(tuned.header())), WHERE)
     for one in (tuned, back):
         found = parameters_of(one.navigator())
         np.testing.assert_array_equal(found["motion.odometry_sigma"], [0.1, 0.2, 0.3])
@@ -197,7 +197,7 @@ def test_what_parameters_say_of_cameras_and_sensors_the_setup_says_itself():
     ).with_params(Params.of(values, WHERE))
     rule = dataclasses.replace(tuned, selector="paper-cost")
     for one in (tuned, rule):
-        for setup in (one, DriveSetup.of_header(decode(encode(one.header())), WHERE)):
+        for setup in (one, DriveSetup.from_header(decode(encode(one.header())), WHERE)):
             np.testing.assert_allclose(setup.vehicle.sensor_sigma, sigma, rtol=1e-12)
             np.testing.assert_allclose(setup.rig.extrinsics_sigma, turned, rtol=1e-12)
             known = parameters_of(setup.navigator())
@@ -210,7 +210,7 @@ def test_a_rule_without_a_gate_drives_without_one():
     tuned = qcar_setup().with_params(Params.of({"motion.gate_nis": 30}, WHERE))
     for selector, gate_nis in (("paper-cost", 30), ("paper-cost-ungated", math.inf)):
         header = dataclasses.replace(tuned, selector=selector).header()
-        navigator = DriveSetup.of_header(decode(encode(header)), WHERE).navigator()
+        navigator = DriveSetup.from_header(decode(encode(header)), WHERE).navigator()
         assert type(navigator.selector).__name__ == "PaperCost"
         assert float(navigator.motion.gate_nis) == gate_nis
 
@@ -259,7 +259,7 @@ def _without(header: dict, key: str) -> dict:
 def test_a_bad_header_is_named_with_its_key(change, line):
     header = decode(encode(qcar_setup().header()))
     with pytest.raises(BadInput) as error:
-        DriveSetup.of_header(change(header), WHERE)
+        DriveSetup.from_header(change(header), WHERE)
     assert str(error.value).startswith(f"drive.mcap: header.{line}")
     assert "\n" not in str(error.value)
 
@@ -290,7 +290,7 @@ def test_any_change_of_a_value_gives_a_setup_or_bad_input(path, value, removes):
     else:
         holder[key] = value
     try:
-        assert isinstance(DriveSetup.of_header(header, WHERE), DriveSetup)
+        assert isinstance(DriveSetup.from_header(header, WHERE), DriveSetup)
     except BadInput as error:
         assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
 
@@ -305,7 +305,7 @@ def test_any_change_of_a_byte_gives_a_setup_or_bad_input(where, new, out):
     except ValueError:
         return
     try:
-        assert isinstance(DriveSetup.of_header(header, WHERE), DriveSetup)
+        assert isinstance(DriveSetup.from_header(header, WHERE), DriveSetup)
     except BadInput as error:
         assert str(error).startswith("drive.mcap: header.")  # noqa: PT017
 
@@ -316,6 +316,6 @@ def test_only_a_drive_that_must_not_says_so(name):
     assert name not in qcar_setup().header()
     header = qcar_setup(**{name: False}).header()
     assert header[name] is False
-    assert not getattr(DriveSetup.of_header(header, WHERE), name)
+    assert not getattr(DriveSetup.from_header(header, WHERE), name)
     with pytest.raises(BadInput, match=rf"drive.mcap: header.{name}"):
-        DriveSetup.of_header(header | {name: "no"}, WHERE)
+        DriveSetup.from_header(header | {name: "no"}, WHERE)

@@ -67,7 +67,7 @@ def drive():
         return jax.lax.scan(step, nav.init(), (poses, noise))
 
     state, (decided, seen) = jax.device_get(run(jnp.asarray(poses), jnp.asarray(noise)))
-    return Learnt.of(*errors_of(state.belief.bank), rig, vehicle), decided, seen
+    return Learnt.from_errors(*errors_of(state.belief.bank), rig, vehicle), decided, seen
 
 
 def test_a_drive_tells_how_a_camera_is_turned_and_what_the_wheels_read(drive):
@@ -106,7 +106,7 @@ def test_the_words_are_those_of_one_who_stands_behind_the_camera(camera, axis, p
         turn = sign * 0.02 * R_vehicle_camera[:, axis]
         e = np.zeros(4 + 3 * len(rig))
         e[4 + 3 * camera : 7 + 3 * camera] = -turn / SIGMA[3:]
-        learnt = Learnt.of(e, np.full(len(e), 1e-3), rig, sensors_as_told())
+        learnt = Learnt.from_errors(e, np.full(len(e), 1e-3), rig, sensors_as_told())
         (sentence,) = learnt.sentences()
         assert word in sentence
         there = turned(rig, camera, turn)
@@ -124,18 +124,18 @@ def test_the_words_are_those_of_one_who_stands_behind_the_camera(camera, axis, p
 def test_a_camera_that_has_seen_nothing_is_no_less_sure_than_before():
     e = np.zeros(4 + 3 * len(told_rig()))
     sigma = np.nextafter(np.ones(len(e), np.float32), 2).astype(float)
-    learnt = Learnt.of(e, sigma, told_rig(), sensors_as_told())
+    learnt = Learnt.from_errors(e, sigma, told_rig(), sensors_as_told())
     assert np.all(learnt.turns_sigma_rad <= learnt.turns_prior_rad)
 
 
 def test_a_rule_that_doubts_nothing_has_learnt_nothing():
-    assert Learnt.of(np.zeros(0), np.zeros(0), told_rig(), sensors_as_told()) is None
+    assert Learnt.from_errors(np.zeros(0), np.zeros(0), told_rig(), sensors_as_told()) is None
 
 
 def test_an_error_beyond_what_its_file_allows_for_is_named_so():
     e = np.zeros(4 + 3 * 4)
     e[0], e[4 + 2] = 0.2, 3.5  # of 3 % and of a sigma
-    told = Learnt.of(e, np.full(len(e), 1e-3), told_rig(), sensors_as_told()).sentences()
+    told = Learnt.from_errors(e, np.full(len(e), 1e-3), told_rig(), sensors_as_told()).sentences()
     camera, wheels = told
     assert camera.endswith("3.5 times the sigma of its file")
     assert wheels.endswith("6.7 times the sigma of its file")
@@ -153,5 +153,5 @@ def test_a_gyro_s_errors_are_those_of_no_camera():
     np.testing.assert_array_equal(turns, -marked[4:-3])
     exact = dataclasses.replace(rig, extrinsics_sigma=None)
     assert as_filed(marked, exact)[1].size == as_filed(marked, None)[1].size == 0
-    learnt = Learnt.of(errors, sigma, rig, vehicle)
+    learnt = Learnt.from_errors(errors, sigma, rig, vehicle)
     np.testing.assert_allclose(learnt.turns_sigma_rad, learnt.turns_prior_rad)

@@ -8,8 +8,8 @@ import pytest
 
 from jaxnav.cli import main
 from jaxnav.recordings.drive_log import read_drive
-from jaxnav.recordings.message_schemas import OUTCOME
 from jaxnav.recordings.plausible import keep_plausible
+from jaxnav.recordings.records import OUTCOME
 from tests.fuzz.seeds import drive_parts, write_drive
 from tests.recordings.test_regression import FOLDER
 

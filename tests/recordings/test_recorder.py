@@ -20,9 +20,8 @@ from mcap.reader import make_reader
 from jaxnav.errors import BadInput
 from jaxnav.recordings import recorder as recorder_module
 from jaxnav.recordings.drive_log import read_drive
-from jaxnav.recordings.messages import input_message
-from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message, outcome_message
 from tests.helpers.drives import (
     make_input,
     make_outcome,
@@ -39,6 +38,11 @@ def _until(condition, timeout_s: float = 10.0) -> None:
     while not condition():
         assert time.monotonic() < end_s, "it never came"
         time.sleep(0.005)
+
+
+def put_inputs(recorder: Recorder, *indices: int) -> None:
+    for index in indices:
+        recorder.put(*input_message(make_input(index)))
 
 
 def test_other_programs_can_read_the_file(tmp_path):
@@ -115,7 +119,7 @@ def test_what_can_not_be_written_is_left_out(tmp_path):
     recorder.image("/camera/front", 3, None)
     recorder.put("/odometry", 4, {"now_ns": 4, "speed_mps": object()})
     recorder.put("/tick", 5, {"now_ns": "five"})
-    recorder.put(*input_message(make_input(2)))
+    put_inputs(recorder, 2)
     recorder.put("/own/topic", 2**70, {"anything": [1, 2]})
     recorder.close()
     assert (recorder.written, recorder.dropped, recorder.failed) == (2, 5, None)
@@ -127,11 +131,11 @@ def test_what_can_not_be_written_is_left_out(tmp_path):
 
 def test_closing_twice_and_recording_after_it(tmp_path):
     recorder = Recorder(tmp_path / "drive.mcap", {})
-    recorder.put(*input_message(make_input(0)))
+    put_inputs(recorder, 0)
     recorder.close()
     size = (tmp_path / "drive.mcap").stat().st_size
     recorder.close()
-    recorder.put(*input_message(make_input(1)))
+    put_inputs(recorder, 1)
     recorder.image("/camera/front", 1, make_picture(1))
     assert (recorder.written, recorder.dropped, recorder.failed) == (1, 2, None)
     assert (tmp_path / "drive.mcap").stat().st_size == size
@@ -181,7 +185,7 @@ def _check_what_is_left(recorder: Recorder, path: Path, problem: str) -> None:
     put = _fill(recorder)
     assert recorder.failed == f"{path}: can't be written: {problem}"
     dropped = recorder.dropped
-    recorder.put(*input_message(make_input(0)))
+    put_inputs(recorder, 0)
     assert recorder.dropped == dropped + 1
     recorder.close()
     log = read_drive(path)
@@ -246,7 +250,7 @@ def blocked(tmp_path, monkeypatch):
     recorder = Recorder(tmp_path / "drive.mcap", {}, queue_messages=20, queue_images=4)
     monkeypatch.setattr(recorder_module._File, "write", stuck)
     monkeypatch.setattr(recorder_module, "FLUSH_S", 0.0)
-    recorder.put(*input_message(make_input(0)))
+    put_inputs(recorder, 0)
     assert entered.wait(10)
     yield recorder, answer
     answer.set()
@@ -255,8 +259,7 @@ def blocked(tmp_path, monkeypatch):
 
 def test_a_disk_that_does_not_answer_holds_nobody_up(blocked, tmp_path):
     recorder, answer = blocked
-    for index in range(1, 1001):
-        recorder.put(*input_message(make_input(3 * index)))
+    put_inputs(recorder, *range(3, 3003, 3))
     assert recorder.dropped == 980
     assert recorder.failed is None
     begin_s = time.monotonic()
@@ -273,11 +276,10 @@ def test_a_disk_that_does_not_answer_holds_nobody_up(blocked, tmp_path):
 
 def test_a_gap_is_told(blocked, tmp_path):
     recorder, answer = blocked
-    for index in range(1, 31):
-        recorder.put(*input_message(make_input(3 * index)))
+    put_inputs(recorder, *range(3, 93, 3))
     answer.set()
     _until(lambda: recorder.written == 21)
-    recorder.put(*input_message(make_input(99)))
+    put_inputs(recorder, 99)
     recorder.close()
     log = read_drive(tmp_path / "drive.mcap")
     assert recorder.dropped == 10
@@ -290,8 +292,7 @@ def test_images_give_way_to_messages(blocked, tmp_path):
     for _ in range(8):
         recorder.image("/camera/front", 1, make_picture(1))
     assert recorder.dropped == 4  # no more than four wait
-    for index in range(1, 17):
-        recorder.put(*input_message(make_input(3 * index)))
+    put_inputs(recorder, *range(3, 51, 3))
     assert recorder.dropped == 4
     answer.set()
     recorder.close()
@@ -301,8 +302,7 @@ def test_images_give_way_to_messages(blocked, tmp_path):
 
 def test_no_image_waits_behind_half_a_queue(blocked):
     recorder, _ = blocked
-    for index in range(1, 11):
-        recorder.put(*input_message(make_input(3 * index)))
+    put_inputs(recorder, *range(3, 33, 3))
     recorder.image("/camera/front", 1, make_picture(1))
     assert recorder.dropped == 1
 
@@ -323,7 +323,7 @@ def test_a_pipe_that_nobody_empties(tmp_path):
         costs_s = []
         for _ in range(1000):
             begin_s = time.monotonic()
-            recorder.put(*input_message(make_input(0)))
+            put_inputs(recorder, 0)
             costs_s.append(time.monotonic() - begin_s)
         assert recorder.dropped == 1001
         assert np.median(costs_s) < 1e-3  # it takes some microseconds
@@ -337,7 +337,7 @@ def test_a_pipe_that_nobody_empties(tmp_path):
 CHILD = """
 import sys, time
 from jaxnav.drive.interfaces import Odometry
-from jaxnav.recordings.messages import input_message
+from jaxnav.recordings.records import input_message
 from jaxnav.drive.pilot import Input
 from jaxnav.recordings.recorder import Recorder
 

@@ -15,7 +15,7 @@ from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_replay import first_difference, replay_drive
 from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.learnt import repeated_share
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 from jaxnav.vehicles.conformance import injections as inject
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Rates
 from tests.helpers.simulated import make_setup, record, simulated
@@ -77,7 +77,7 @@ def test_a_recorded_drive_comes_out_as_it_did(name, request):
         told = [(step.input, step.outcome) for step in steps]
         record(path, setup.header() | {"made_by": {}}, told)
     log = read_drive(path)
-    outcomes = list(replay_drive(log.inputs, DriveSetup.of_header(log.header, path), None))
+    outcomes = list(replay_drive(log.inputs, DriveSetup.from_header(log.header, path), None))
     difference = first_difference(log, outcomes)
     if is_updated:
         if difference is not None:
@@ -109,6 +109,6 @@ def test_a_car_that_is_carried_off_teaches_no_share_of_errors_that_repeat():
     """The frames that contradict a pose until the filter gives it up repeat one error."""
     path = FOLDER / "kidnapped.mcap"
     log = read_drive(path)
-    outcomes = list(replay_drive(log.inputs, DriveSetup.of_header(log.header, path), None))
+    outcomes = list(replay_drive(log.inputs, DriveSetup.from_header(log.header, path), None))
     assert sum(outcome.rejects != 0 for outcome in outcomes) >= 10
     assert max(repeated_share(outcome.belief) for outcome in outcomes) == 0

@@ -28,9 +28,8 @@ from jaxnav.files import save_rig
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_replay import first_difference, replay_drive
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import input_message
-from jaxnav.recordings.outcomes import Outcomes
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import Outcomes, input_message
 from jaxnav.vehicles.conformance import check_cameras, check_vehicle
 from jaxnav.vehicles.replay import ReplayVehicle, open_cameras
 from tests.helpers.drives import BEGIN_NS, make_detections, make_picture
@@ -371,7 +370,7 @@ def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
     assert len(corners) > 40
     assert readings.items() <= recorded_readings.items()
     assert corners.items() <= recorded_corners.items()
-    again_alone = replay_drive(log.inputs, DriveSetup.of_header(log.header, again), None)
+    again_alone = replay_drive(log.inputs, DriveSetup.from_header(log.header, again), None)
     assert first_difference(log, again_alone) is None
     assert Health.OK in log.outcomes.health
     cameras = log.header["rig"]["cameras"]

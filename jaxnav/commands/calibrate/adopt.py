@@ -30,13 +30,13 @@ def run(args: CalibrateAdopt) -> int:
     """Read what the drive has learnt, write it into new files, and print it."""
     configure_jax(float64=True)
     log = read_shown(args.recording, args.headless)
-    setup = DriveSetup.of_header(log.header, log.path)
+    setup = DriveSetup.from_header(log.header, log.path)
     vehicle = setup.car(log.path)
     given = given_files(args, ("rig", "vehicle"))
     _refuse_others(args, setup, given)
     index = _last_sure(log)
     errors, sigma = log.outcomes.errors, log.outcomes.errors_sigma
-    learnt = Learnt.of(errors[index], sigma[index], setup.rig, vehicle)
+    learnt = Learnt.from_errors(errors[index], sigma[index], setup.rig, vehicle)
     assert learnt is not None  # _last_sure
     calibrated = provenance("adopt", [log.path])
     out = output_folder(args.out)

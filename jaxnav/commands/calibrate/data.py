@@ -13,7 +13,7 @@ from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
 from jaxnav.files import load_markers, load_rig
-from jaxnav.recordings.other.sightings import RecordedSightings, read_sightings
+from jaxnav.recordings.other.recordings import RecordedSightings, read_sightings
 
 _LEAST_SIGHTINGS = 3  # of a marker that is in no map
 _APART_NS = 10**12  # between recordings

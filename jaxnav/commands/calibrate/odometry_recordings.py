@@ -22,7 +22,7 @@ from jaxnav.files.ranges import is_within
 from jaxnav.files.vehicles import as_car
 from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.other.recording import check_winding
-from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.other.ros import read_ros_drive
 
 _NONE = Detections.concatenate([])
 _READING = np.dtype([("stamp_ns", np.int64), ("speed_mps", float), ("steering_rad", float)])
@@ -77,7 +77,7 @@ def _own(args: Arguments, files: tuple[Path, ...]) -> RecordedDrives:
             if flags[key] is None and log.header.get(key) != logs[0].header.get(key):
                 problem = f"was driven with another {key} than {logs[0].path}: say which by --{key}"
                 raise BadInput(log.path, problem)
-    setup = DriveSetup.of_header(logs[0].header, logs[0].path)
+    setup = DriveSetup.from_header(logs[0].header, logs[0].path)
     setup = replace(setup, **given_files(args, _SHARED))
     vehicle = (
         setup.car(logs[0].path) if args.vehicle is None else as_car(setup.vehicle, args.vehicle)

@@ -163,7 +163,7 @@ def stamps(path: Path) -> Iterator[Finding]:
         BadInput: the file is no recording, or damaged, or not of a car.
     """
     log = read_drive(path)
-    setup = DriveSetup.of_header(log.header, path)
+    setup = DriveSetup.from_header(log.header, path)
     setup.car(path)
     delays = delays_of(log, setup)
     for text in warnings(delays, setup):

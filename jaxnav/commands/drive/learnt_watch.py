@@ -43,7 +43,7 @@ class LearntWatch:
         if given.now_ns - self._last_ns < _PERIOD_NS or not outcome.output.decided:
             return
         self._last_ns = given.now_ns
-        learnt = Learnt.of(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
+        learnt = Learnt.from_errors(*errors_of(outcome.belief.bank), self._rig, self._vehicle)
         self._found = {} if learnt is None else learnt.found()
         share = repeated_share(outcome.belief)
         if share is not None and share >= _TELLS_SHARE:

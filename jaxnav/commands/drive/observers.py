@@ -24,9 +24,6 @@ from jaxnav.drive.loop import Observer
 from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import Containment
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.message_schemas import OUTCOME
-from jaxnav.recordings.messages import digest, input_message
-from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.recordings.recorder import Recorder
 
 if TYPE_CHECKING:
@@ -122,9 +119,7 @@ class DriveRecorder:
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
-        self._recorder.put(*input_message(given))
-        message = outcome_message(outcome, digest(outcome))
-        self._recorder.put(OUTCOME, given.now_ns, message)
+        self._recorder.record(given, outcome)
 
     def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""

@@ -34,7 +34,7 @@ from jaxnav.files.configuration import step_folder
 from jaxnav.pictures.localisation import localisation_report
 from jaxnav.recordings.drive_events import DriveEvents, refused_odometry
 from jaxnav.recordings.drive_format import PROFILE
-from jaxnav.recordings.drive_log import DriveLog
+from jaxnav.recordings.drive_log import DriveLog, profile_of
 from jaxnav.recordings.drive_replay import (
     Comparison,
     check_inputs,
@@ -42,14 +42,11 @@ from jaxnav.recordings.drive_replay import (
     replay_drive,
 )
 from jaxnav.recordings.drive_setup import DriveSetup, needs_float64
-from jaxnav.recordings.mcap_messages import profile_of
-from jaxnav.recordings.message_schemas import OUTCOME
-from jaxnav.recordings.messages import digest, input_message
-from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.other.ros import read_ros_drive
 from jaxnav.recordings.other.smoothed_drive import distances
-from jaxnav.recordings.outcomes import Outcomes, outcome_message
 from jaxnav.recordings.plausible import keep_plausible
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import Outcomes
 
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
@@ -172,7 +169,7 @@ def run(args: Arguments) -> int:
     events = None
     if args.smooth:
         refused_ns = set() if log is None else refused_odometry(log)
-        events = DriveEvents.of(inputs, setup, args.recording, refused_ns)
+        events = DriveEvents.from_inputs(inputs, setup, args.recording, refused_ns)
     changed = [name for name in _OVERRIDES if getattr(args, name)]
     comparison = Comparison(log) if log is not None and not changed else None
     out = output_folder(args.out)
@@ -216,7 +213,7 @@ _Drive = tuple[DriveLog | None, DriveSetup, Sequence[Input]]
 def _own_drive(args: Arguments, params: Params | None) -> _Drive:
     log = read_shown(args.recording, args.headless)
     configure_jax(float64=needs_float64(log.header, args.recording), threads=1)
-    setup = DriveSetup.of_header(log.header, args.recording)
+    setup = DriveSetup.from_header(log.header, args.recording)
     setup = _tuned(dataclasses.replace(setup, **given_files(args, _FILES)), args, params)
     if args.images:
         return log, setup, inputs_from_images(log, setup, args.corner_backend)[0]
@@ -269,9 +266,7 @@ def _replayed(
             if comparison is not None:
                 comparison.look(outcome)
             if recorder is not None:
-                recorder.put(*input_message(given))
-                message = outcome_message(outcome, digest(outcome))
-                recorder.put(OUTCOME, given.now_ns, message)
+                recorder.record(given, outcome)
             update(1)
         if recorder is not None:
             recorder.close(timeout_s=60.0)

@@ -26,6 +26,7 @@ from jaxnav.core.models.vehicle import OdometryErrors
 from jaxnav.core.navigator import Navigator, Step
 from jaxnav.drive.compiled_step import compiled_step
 from jaxnav.drive.interfaces import Camera, Setup
+from jaxnav.drive.pilot import Outcome
 from jaxnav.drive.seeing import Search
 from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput
@@ -33,7 +34,6 @@ from jaxnav.files import Params, apply_params, load_markers, load_params
 from jaxnav.files.configuration import step_folder
 from jaxnav.files.ros import RosFile
 from jaxnav.recordings.ros.body import BodyTracker
-from jaxnav.recordings.ros.estimates import Report
 from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
 from jaxnav.recordings.ros.odometry_track import GrowingTrack
 from jaxnav.vehicles.ros.connection import Connection
@@ -89,7 +89,7 @@ class PreparedBody:
 
     def begin(self) -> Activity:
         """Begin to track it, with nothing known."""
-        tracker = self._tracker(self._navigator, self._step, self._send)
+        tracker = self._tracker(self._navigator, self._step, self._publisher.publish)
         ends: list[Any] = []
         if self.file.odometry is not None:
             clock = self._connection.source_clock()
@@ -124,24 +124,19 @@ class PreparedBody:
         navigator = apply_params(navigator, params_read)
         step = compiled_step(navigator, step_folder())
         searches = searches_for(self._args.corner_backend, rig, markers)
-        tracker = self._tracker(navigator, step, lambda report: None)
+        tracker = self._tracker(navigator, step, lambda outcome: None)
         others = [search.warm_up for search in searches]
         timed(self._say, lambda: [warm_up() for warm_up in (tracker.warm_up, *others)])
         return navigator, step, searches
 
     def _tracker(
-        self, navigator: Navigator, step: Step, tell: Callable[[Report], None]
+        self, navigator: Navigator, step: Step, publish: Callable[[Outcome], None]
     ) -> BodyTracker:
         file, contained = self.file, self._connection.contained
         track = None
         if file.odometry is not None:
             track = GrowingTrack(file.T_vehicle_sensor, file.odometry_delay_s)
-        return BodyTracker(navigator, step, len(file.cameras), tell, track, contained)
-
-    def _send(self, report: Report) -> None:
-        if report.decided:
-            self._publisher.send_transform(report.now_ns, report.T_map_base)
-        self._publisher.publish(report)
+        return BodyTracker(navigator, step, len(file.cameras), publish, track, contained)
 
 
 def _errors(file: RosFile) -> OdometryErrors | None:

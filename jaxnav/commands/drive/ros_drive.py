@@ -38,9 +38,8 @@ from jaxnav.files.ros import RosFile
 from jaxnav.files.vehicles import may_resume
 from jaxnav.recordings.drive_replay import check_inputs
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.other.ros import read_ros_drive
 from jaxnav.recordings.ros import message_type
-from jaxnav.recordings.ros.estimates import pose_of_drive, report_of_drive
 from jaxnav.vehicles.ros.connection import Connection
 from jaxnav.vehicles.ros.odom_frame import OdomFrame
 from jaxnav.vehicles.ros.publisher import Publisher
@@ -139,7 +138,7 @@ class PreparedDrive:
         setup, signals = self._setup, self._signals
         pilot = setup.pilot(step_folder())
         pilot.warm_up()
-        reporter = _Reporter(self._publisher, self.file.base_x_m)
+        reporter = _Reporter(self._publisher)
         keeper = LearntKeeper(self.file, setup)
         exposures = ExposureWatch(setup.rig.names, self._searches)
         observers: list[Any] = [reporter, keeper, exposures, *self._record()]
@@ -275,20 +274,15 @@ class _Reporter:
     faults = Fault(0)
     closing_note: str | None = None
 
-    def __init__(self, publisher: Publisher, base_x_m: float):
-        self._publisher, self._base_x_m = publisher, base_x_m
-        self._last_ns = 0
+    def __init__(self, publisher: Publisher):
+        self._publisher, self._last_ns = publisher, 0
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
         """See `Observer`."""
         shows = outcome.data is not None and outcome.data.corners_px is not None
         if shows or abs(outcome.now_ns - self._last_ns) > _LEAST_NS:
             self._last_ns = outcome.now_ns
-            if outcome.output.decided:
-                pose = pose_of_drive(outcome, self._base_x_m)
-                seen_ns = outcome.stamp_ns if shows else None
-                self._publisher.send_transform(outcome.now_ns, pose, seen_ns)
-            self._publisher.publish(report_of_drive(outcome, self._base_x_m))
+            self._publisher.publish(outcome, outcome.stamp_ns if shows else None)
 
     def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
         """See `Observer`."""

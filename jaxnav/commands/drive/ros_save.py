@@ -96,7 +96,7 @@ class LearntKeeper:
         rig_path, vehicle_path = path_of(self._file, "rig"), path_of(self._file, "vehicle")
         setup = self._setup
         with jax.enable_x64(True):
-            learnt = Learnt.of(*known, setup.rig, setup.vehicle)
+            learnt = Learnt.from_errors(*known, setup.rig, setup.vehicle)
             if learnt is None:
                 raise BadInput(_WHERE, f"the drive {NOTHING_KEPT}")
             rig, vehicle = load_rig(rig_path), as_car(load_vehicle(vehicle_path), vehicle_path)

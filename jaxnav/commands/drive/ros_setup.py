@@ -14,9 +14,9 @@ from jaxnav.files import load_rig
 from jaxnav.files.ros import RosFile
 from jaxnav.files.validation import at
 from jaxnav.recordings.drive_setup import PILOT_SELECTORS
-from jaxnav.recordings.ros.lenses import with_lenses
 from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY, TWIST_TYPES
-from jaxnav.vehicles.ros.connection import Connection, await_lenses
+from jaxnav.vehicles.ros.connection import Connection
+from jaxnav.vehicles.ros.lenses import await_lenses, with_lenses
 from jaxnav.vehicles.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf
 from jaxnav.vehicles.ros.publisher import FrameNames, Publisher
 
@@ -53,7 +53,8 @@ def publisher_for(
     """
     frames = FrameNames(file.frames.map, file.frames.odom, file.frames.base)
     try:
-        return Publisher(connection, frames, markers, odom, file.tf_tolerance_s)
+        base_x_m = 0.0 if file.vehicle is None else file.base_x_m
+        return Publisher(connection, frames, markers, odom, file.tf_tolerance_s, base_x_m)
     except ImportError as error:
         problem = f"a message package of ROS 2 is missing ({error}): see docs/guide/ros.md"
         raise BadInput("jaxnav ros", problem) from None

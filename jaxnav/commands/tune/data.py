@@ -142,7 +142,7 @@ def _known(recorded: FrameSequences) -> Callable[[Progress], FrameSequences]:
 def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedSequences:
     if path.suffix == _DRIVE:
         log = read_shown(path, args.headless)
-        setup = DriveSetup.of_header(log.header, path)
+        setup = DriveSetup.from_header(log.header, path)
         return NamedSequences(str(path), setup.navigator(), sequences_of_drive(log, setup, part))
     recording = read_recording(
         path,

@@ -52,7 +52,7 @@ def sequences_of_drive(
     Raises:
         BadInput: a frame of a camera that the rig does not have, or no marker is in view.
     """
-    events = DriveEvents.of(log.inputs, setup, log.path, refused_odometry(log))
+    events = DriveEvents.from_inputs(log.inputs, setup, log.path, refused_odometry(log))
     begin, end = _bounds(len(events), part)
     if not np.any(events.obs.visible[begin:end]):
         problem = f"{end - begin} of its {len(events)} events, and none shows a marker of the map"

@@ -27,7 +27,7 @@ from jaxnav.drive.flags import Fault, Health, Reject, names
 from jaxnav.files import poses
 from jaxnav.pictures.localisation import BLUE, GREEN, ORANGE, SKY, VERMILION
 from jaxnav.recordings.learnt import as_filed
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 
 # A JPEG, or grey or BGR pixels.
 Picture = bytes | UInt8[np.ndarray, "rows columns"] | UInt8[np.ndarray, "rows columns 3"]

@@ -31,7 +31,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.drive.pilot import Outcome
 from jaxnav.errors import BadInput
 from jaxnav.pictures.rerun.scene import Picture, RerunScene
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 
 APPLICATION = "jaxnav"
 _IDLE_S = 0.02  # between looks at an empty queue
@@ -103,7 +103,7 @@ class RerunView:
         """Show the pilot's outcome of an event. Never raises."""
         has_corners = outcome.data is not None and outcome.data.corners_px is not None
         if self._is_due((outcome.health, has_corners), outcome.now_ns):
-            self._offer(lambda scene: scene.show(Outcomes.of(outcome)))
+            self._offer(lambda scene: scene.show(Outcomes.from_outcome(outcome)))
 
     def show_recorded(self, outcomes: Outcomes, index: int) -> None:
         """Show an outcome of a recorded drive. Never raises."""

@@ -1,4 +1,4 @@
-"""Whether the stamps of an odometry fit those of the cameras, by how the body turns.
+"""Find a delay between odometry and cameras from how the body turns.
 
 Of poses that markers show at two times, and the odometry's, the turns between are the same. Where
 its stamps are off, those that fit best are those of other times. A hand turns by degrees within a
@@ -23,7 +23,7 @@ _STEP_S = 0.02
 _APART_S = (0.1, 3.0)  # between the two times of a turn
 _MOST_TURNS = 2000
 _LEAST_TURNS = 30
-_CLEARLY = 0.7  # misfit of the best delay against that of none, above which none is told
+_CLEARLY = 0.7  # misfit of the best delay against that of none, above which none is reported
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ def odometry_delay(
         both = known[first] & known[second]
         if np.sum(both) < _LEAST_TURNS:
             return np.inf
-        told = R[first[both]].inv() * R[second[both]]
-        return float(np.median((turns[both].inv() * told).magnitude()))
+        by_odometry = R[first[both]].inv() * R[second[both]]
+        return float(np.median((turns[both].inv() * by_odometry).magnitude()))
 
     if len(first) < _LEAST_TURNS:
         return None

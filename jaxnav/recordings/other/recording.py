@@ -1,11 +1,11 @@
-"""Recorded marker detections of a camera rig, as arrays of fixed shape.
+"""Recorded detections of markers by a camera rig, as arrays.
 
 The vehicle frame is the rig's body, the world is the marker map's frame.
 
 Conventions of the existing recordings, as found in their data:
 
-* Corners are counter-clockwise from the bottom left (AprilTag's order); ours are clockwise from
-  the top left. The marker frame is ours already: x right, y up, z towards the reader.
+* Corners are counter-clockwise from the bottom left (AprilTag's order), `TO_OURS` makes them ours,
+  clockwise from the top left. The marker frame is ours already: x right, y up, z to the reader.
 * Pixels are used unchanged. Calibration and reference were computed from the same corners, so
   a shift by half a pixel would only make them disagree (reprojection of the reference over 31 297
   detections: 1.11 px RMS a coordinate as recorded, 1.20 and 1.22 px half a pixel to either side).
@@ -13,7 +13,7 @@ Conventions of the existing recordings, as found in their data:
   the two is false, and missing a sighting costs less than believing a false one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -26,6 +26,8 @@ from jaxnav.core.models.imu import ImuSamples, Preintegrated
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection.observe import double_area_px2
+from jaxnav.detection.types import Detections
+from jaxnav.drive.interfaces import Odometry
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import is_within
 from jaxnav.recordings.ros.odometry_track import OdometryTrack
@@ -119,23 +121,50 @@ class Recording:
 
 @dataclass(frozen=True)
 class Rows:
-    """A table of N detections in the order and convention of their file."""
+    """A table of N detections in the order of their file."""
 
     stamps_ns: Int[np.ndarray, " N"]
     cameras: Int[np.ndarray, " N"]  # index in the rig
     ids: Int[np.ndarray, " N"]
-    corners_px: Float[np.ndarray, "N 4 2"]  # BL BR TR TL
+    corners_px: Float[np.ndarray, "N 4 2"]  # TL TR BR BL
     frame_stamps_ns: Int[np.ndarray, " F"]  # of all frames, those without a detection as well
+    families: tuple[str, ...] | None = None  # (N,); None where the recording does not tell
+
+
+def rows_of(
+    frames: Sequence[tuple[int, int, Detections]],
+    frame_stamps_ns: Sequence[int],
+    tells_families: bool = True,
+) -> Rows:
+    """The table of the detections in frames.
+
+    Args:
+        frames: stamp in ns, camera, and what was detected.
+        frame_stamps_ns: of all frames.
+        tells_families: whether the families of the detections are known.
+    """
+    counts = [len(found) for *_, found in frames]
+    whole = Detections.concatenate([found for *_, found in frames])
+    return Rows(
+        stamps_ns=np.repeat(np.array([stamp_ns for stamp_ns, *_ in frames], np.int64), counts),
+        cameras=np.repeat(np.array([camera for _, camera, _ in frames], int), counts),
+        ids=whole.ids.astype(np.int64),
+        corners_px=whole.corners_px.astype(float),
+        frame_stamps_ns=np.array(frame_stamps_ns, np.int64),
+        families=whole.families if tells_families else None,
+    )
 
 
 @dataclass(frozen=True)
-class RecordingSource:
-    """The content of a file: detections and cameras, with functions that read map and reference.
+class Source:
+    """The content of a recording in any format, with functions that read map and reference.
 
     Attributes:
         markers: returns the map; raises BadInput where there is none, or a broken one.
         reference: returns stamp in ns -> (7,) wxyz xyz of the vehicle in the world, or None.
         odometry: of the vehicle, by other software.
+        imu: on the vehicle.
+        readings: of a car's odometer, in the order in which they came.
     """
 
     name: str
@@ -144,31 +173,24 @@ class RecordingSource:
     markers: Callable[[], MarkerMap]
     reference: Callable[[], dict[int, Float[np.ndarray, " 7"]] | None] = lambda: None
     odometry: OdometryTrack | None = None
+    imu: ImuSamples | None = None
+    readings: tuple[Odometry, ...] = ()
 
 
-def assemble(
-    path: Path,
-    name: str,
-    rows: Rows,
-    rig: CameraRig,
-    markers: MarkerMap,
-    poses: dict[int, Float[np.ndarray, " 7"]] | None = None,
-    odometry: OdometryTrack | None = None,
-    imu: ImuSamples | None = None,
-) -> Recording:
-    """Make a recording of a table of detections.
+def assemble(path: Path, source: Source, markers: MarkerMap | None = None) -> Recording:
+    """Make a recording of a source.
 
     Args:
         path: named where the corners are wrong.
-        poses: the reference, stamp in ns -> (7,) wxyz xyz of the vehicle in the world.
-        odometry: of the vehicle, by other software.
-        imu: on the vehicle.
+        markers: replace the source's own.
 
     Raises:
         BadInput: two families share an id in the map, the detections do not tell families; or
             corners are in another order than they should be.
     """
-    check_winding(path, rows.corners_px[:, TO_OURS])
+    rows, rig, markers = source.rows, source.rig, markers or source.markers()
+    poses = source.reference()
+    check_winding(path, rows.corners_px)
     if len(set(markers.ids)) < len(markers.ids):
         raise BadInput("--markers", "ids must differ: the recording does not tell families")
     stamps = np.unique(rows.frame_stamps_ns)
@@ -187,15 +209,15 @@ def assemble(
     used = used[once[used]]
     used = used[np.lexsort((index[used], rows.cameras[used], frame[used]))]
     return Recording(
-        name=name,
+        name=source.name,
         stamps_ns=stamps,
         seen_at=np.stack([frame[used], rows.cameras[used], index[used]]),
-        seen_px=rows.corners_px[used][:, TO_OURS],
+        seen_px=rows.corners_px[used],
         rig=rig,
         markers=markers,
         reference=None if poses is None else _align(stamps, poses),
-        odometry=odometry,
-        imu=imu,
+        odometry=source.odometry,
+        imu=source.imu,
         unmapped_detections=int(np.sum(~mapped)),
         dropped_detections=int(np.sum(mapped)) - len(used),
     )

@@ -1,4 +1,4 @@
-"""Localisation of every frame of a recording by the estimator, in 6 degrees of freedom.
+"""Localise a rig in every frame of a recording, in 6 degrees of freedom.
 
 The same `Navigator.step` that runs on a vehicle is scanned over the frames, a chunk at a time.
 """
@@ -31,7 +31,7 @@ from jaxnav.core.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, limits
 from jaxnav.recordings.other.recording import Recording
-from jaxnav.recordings.other.smoothed import Behind, Kept, Localised, Packed, smooth_frames
+from jaxnav.recordings.other.smoothed import Kept, Localised, Packed, smooth_chunks
 from jaxnav.recordings.ros.body import MAX_DT_S
 
 CHUNK_FRAMES = 64
@@ -90,7 +90,7 @@ def replay(
             or an estimate from the recording, see `estimate_corner_sigma_px`.
         progress: called with the number of frames done since the last call.
         params: replace the navigator's own.
-        smooth: whether a pose is told what was seen after it as well as before.
+        smooth: whether a pose is by what was seen after it as well as before.
 
     Raises:
         BadInput: a parameter that does not fit a rig that moves freely.
@@ -120,21 +120,21 @@ def replay(
         lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)),
         (alone if one_at_a_time else navigator).init(),
     )
-    total, told = len(recording), (recording.twists, recording.preintegrated)
-    first = _frames(recording, told, 0)
+    total, motions = len(recording), (recording.twists, recording.preintegrated)
+    first = _frames(recording, motions, 0)
     run_chunk = _run_chunk.lower(navigator, state, first, one_at_a_time, smooth).compile()
     started = time.perf_counter()
     begins = range(0, total, CHUNK_FRAMES)
     chunks, kept = [], []
     for begin in begins:
-        state, outputs, to_smooth = run_chunk(navigator, state, _frames(recording, told, begin))
+        state, outputs, to_smooth = run_chunk(navigator, state, _frames(recording, motions, begin))
         chunks.append(jax.device_get(outputs))
         if smooth:
-            kept.append(Packed.of(to_smooth))
+            kept.append(Packed.from_kept(to_smooth))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
 
-    def told_of(chunks: list[_Told]) -> Replay:
+    def joined(chunks: list[_Judged]) -> Replay:
         pose, seen, located, decided, flip_probability, nees, branch = jax.tree.map(
             lambda *leaves: np.concatenate(leaves)[:total], *chunks
         )
@@ -150,18 +150,19 @@ def replay(
             corner_sigma_px,
         )
 
-    filtered = told_of(chunks)
+    filtered = joined(chunks)
     if not smooth:
         return filtered
     obs_of = jax.vmap(_Frames.observation)
-    any_obs = jax.tree.map(lambda leaf: leaf[0], obs_of(first))
-    behind = Behind.nothing(navigator, tracks, any_obs)
-    for index, begin in reversed(list(enumerate(begins))):
-        frames = _frames(recording, told, begin)
-        behind, poses = smooth_frames(navigator, behind, kept.pop().unpack(), obs_of(frames))
-        chunks[index] = jax.device_get(_told_all(poses, frames.T_world_vehicle_true))
-        progress(min(CHUNK_FRAMES, total - begin))
-    return dataclasses.replace(told_of(chunks), filtered=filtered)
+
+    def observations(index: int) -> Observation:
+        return obs_of(_frames(recording, motions, begins[index]))
+
+    for index, poses in smooth_chunks(navigator, tracks, kept, observations):
+        truth = _frames(recording, motions, begins[index]).T_world_vehicle_true
+        chunks[index] = jax.device_get(_judge_all(poses, truth))
+        progress(min(CHUNK_FRAMES, total - begins[index]))
+    return dataclasses.replace(joined(chunks), filtered=filtered)
 
 
 def motion_of(recording: Recording) -> FreeBody:
@@ -207,11 +208,11 @@ def _best_e1_px2(
 
 
 # Of a frame: poses (tracks, 7), and the next six fields of `Replay`.
-_Told = tuple[Array, Array, Array, Array, Array, Array, Branch]
+_Judged = tuple[Array, Array, Array, Array, Array, Array, Branch]
 
 
-def _told(poses: Localised, T_world_vehicle_true: Array) -> _Told:
-    """What is told of one frame of one track, judged against its reference."""
+def _judge(poses: Localised, T_world_vehicle_true: Array) -> _Judged:
+    """One frame of one track, judged against its reference."""
     truth = jaxlie.SE3(T_world_vehicle_true)
     T, selected = poses.T_world_vehicle, poses.selected
     return (
@@ -225,24 +226,24 @@ def _told(poses: Localised, T_world_vehicle_true: Array) -> _Told:
     )
 
 
-_told_all = jax.jit(jax.vmap(jax.vmap(_told, (0, None))))
+_judge_all = jax.jit(jax.vmap(jax.vmap(_judge, (0, None))))
 
 
 @functools.partial(jax.jit, static_argnums=(3, 4))
 def _run_chunk(
     navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool, smooth: bool
-) -> tuple[State, _Told, Kept | None]:
+) -> tuple[State, _Judged, Kept | None]:
     """Run all tracks over the frames of a chunk; `state` has a leading axis (tracks,).
 
     Returns also what a smoother needs of the frames, where it is asked for.
     """
     markers = navigator.markers
-    Outputs = tuple[_Told, Kept | None]
+    Outputs = tuple[_Judged, Kept | None]
 
     def outputs_of(markers: MarkerMap, state: State, frame: _Frames) -> tuple[State, Outputs]:
         state, out = _with_markers(navigator, markers).step(state, frame.observation())
-        told = _told(Localised.of(out), frame.T_world_vehicle_true)
-        return state, (told, Kept.of(state.belief, out) if smooth else None)
+        judged = _judge(Localised.from_estimate(out), frame.T_world_vehicle_true)
+        return state, (judged, Kept.from_estimate(state.belief, out) if smooth else None)
 
     def step(state: State, frame: _Frames) -> tuple[State, Outputs]:
         def alone(state: State, marker: Array) -> tuple[State, Outputs]:
@@ -259,8 +260,8 @@ def _run_chunk(
         tracks = jnp.arange(len(markers.ids) if one_at_a_time else 1)
         return jax.vmap(alone if one_at_a_time else together)(state, tracks)
 
-    state, (told, kept) = jax.lax.scan(step, state, chunk)
-    return state, told, kept
+    state, (judged, kept) = jax.lax.scan(step, state, chunk)
+    return state, judged, kept
 
 
 def _with_markers(navigator: Navigator, markers: MarkerMap) -> Navigator:
@@ -290,9 +291,9 @@ def _frames(recording: Recording, motions: _Motions, begin: int) -> _Frames:
     corners_px, visible = recording.lanes(frames)
     twists, imu = jax.tree.map(lambda rows: rows[frames], motions)
     # Over a longer pause the motion is predicted for a while only, unless a sensor tells it.
-    told = False if twists is None else np.isfinite(twists).all(axis=1)
-    told = told if imu is None else told | (imu.duration_s > 0)
-    dt_s = np.where(told, dt_s, np.clip(dt_s, 0, MAX_DT_S))
+    known = False if twists is None else np.isfinite(twists).all(axis=1)
+    known = known if imu is None else known | (imu.duration_s > 0)
+    dt_s = np.where(known, dt_s, np.clip(dt_s, 0, MAX_DT_S))
 
     hidden = np.zeros((CHUNK_FRAMES - len(frames), *visible.shape[1:]), bool)
     return _Frames(

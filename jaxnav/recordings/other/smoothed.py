@@ -1,6 +1,7 @@
-"""The poses of a recording by all that was seen: back from the end through a filter's beliefs."""
+"""Smooth the poses of a recording: go back from its end through the beliefs of a filter."""
 
 import dataclasses
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,14 +23,14 @@ from jaxnav.core.pose.refine import Candidates
 
 
 class Kept(eqx.Module):
-    """What is kept of filtered frames to smooth them, leading axes (F, tracks) or none."""
+    """The part of filtered frames that a smoother needs, leading axes (F, tracks) or none."""
 
     belief: Belief  # without what repeats
     candidates: Candidates
 
     @staticmethod
-    def of(belief: Belief, estimate: Estimate) -> "Kept":
-        """What is kept of one frame."""
+    def from_estimate(belief: Belief, estimate: Estimate) -> "Kept":
+        """Of one frame."""
         bare = eqx.tree_at(lambda b: b.repeats, belief, None, is_leaf=lambda leaf: leaf is None)
         return Kept(bare, estimate.candidates)
 
@@ -43,7 +44,7 @@ class Packed(NamedTuple):
     covariance: Float[np.ndarray, "rows d d"]
 
     @staticmethod
-    def of(kept: Kept) -> "Packed":
+    def from_kept(kept: Kept) -> "Packed":
         """Pack frames."""
         kept = jax.device_get(kept)
         bank = kept.belief.bank
@@ -65,29 +66,8 @@ def _moments(kept: Kept) -> tuple[Array, Array]:
     return kept.belief.bank.mean, kept.belief.bank.covariance
 
 
-class Behind(eqx.Module):
-    """What lies behind a frame on the way back, leading axis (tracks,)."""
-
-    trail: Trail
-    parent: Int[Array, "tracks K"]
-    obs: Observation  # one for all tracks
-
-    @staticmethod
-    def nothing(navigator: Navigator, tracks: int, obs: Observation) -> "Behind":
-        """The end of a recording.
-
-        Args:
-            obs: any of its observations.
-        """
-        bank = navigator.motion.init(navigator.selector.hypotheses)
-        one = Behind(Trail.begin(bank, jnp.asarray(False)), bank.parent, obs)
-
-        def wide(leaf: Array) -> Array:
-            return jnp.broadcast_to(leaf, (tracks, *leaf.shape))
-
-        return dataclasses.replace(
-            one, trail=jax.tree.map(wide, one.trail), parent=wide(one.parent)
-        )
+# Of what lies behind a frame on the way back, for each track; and the observation of all tracks.
+_Behind = tuple[Trail, Int[Array, "tracks K"], Observation]
 
 
 class Localised(eqx.Module):
@@ -102,17 +82,43 @@ class Localised(eqx.Module):
     selected: Int[Array, "..."]  # of the candidates; -1: none
 
     @staticmethod
-    def of(estimate: Estimate) -> "Localised":
-        """What a filter has said of one frame."""
+    def from_estimate(estimate: Estimate) -> "Localised":
+        """The poses of one filtered frame."""
         same = {f.name: getattr(estimate, f.name) for f in dataclasses.fields(Localised)}
         same["covariance"] = estimate.covariance[:6, :6]
         return Localised(**same)
 
 
+def smooth_chunks(
+    navigator: Navigator,
+    tracks: int,
+    kept: list[Packed],
+    observations: Callable[[int], Observation],
+) -> Iterator[tuple[int, Localised]]:
+    """Go back through the chunks of a recording: yield the index and the poses of each.
+
+    Args:
+        navigator: the one that filtered them.
+        kept: of each chunk; it is emptied on the way.
+        observations: of the chunk with an index, (F,) in every leaf.
+    """
+    bank = navigator.motion.init(navigator.selector.hypotheses)
+    end = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (tracks, *leaf.shape)),
+        (Trail.begin(bank, jnp.asarray(False)), bank.parent),
+    )
+    behind: _Behind | None = None
+    for index in reversed(range(len(kept))):
+        obs = observations(index)
+        behind = behind or (*end, jax.tree.map(lambda leaf: leaf[0], obs))  # any
+        behind, poses = smooth_frames(navigator, behind, kept.pop().unpack(), obs)
+        yield index, poses
+
+
 @jax.jit
 def smooth_frames(
-    navigator: Navigator, behind: Behind, kept: Kept, obs: Observation
-) -> tuple[Behind, Localised]:
+    navigator: Navigator, behind: _Behind, kept: Kept, obs: Observation
+) -> tuple[_Behind, Localised]:
     """Go back through frames, from the last to the first.
 
     Args:
@@ -127,14 +133,12 @@ def smooth_frames(
         trail = trail.back(navigator.motion, belief.bank, belief.decided, parent, later)
         return trail, _report(navigator, trail, kept)
 
-    def back(behind: Behind, frame: tuple[Kept, Observation]) -> tuple[Behind, Localised]:
-        kept, obs = frame
-        trail, smoothed = jax.vmap(
-            lambda trail, parent, kept: one(trail, parent, kept, behind.obs)
-        )(behind.trail, behind.parent, kept)
-        return Behind(trail, kept.belief.bank.parent, obs), smoothed
+    def back(behind: _Behind, frame: tuple[Kept, Observation]) -> tuple[_Behind, Localised]:
+        (trail, parent, later), (kept, obs) = behind, frame
+        trail, smoothed = jax.vmap(one, (0, 0, 0, None))(trail, parent, kept, later)
+        return (trail, kept.belief.bank.parent, obs), smoothed
 
-    smoothed: tuple[Behind, Localised] = jax.lax.scan(back, behind, (kept, obs), reverse=True)
+    smoothed: tuple[_Behind, Localised] = jax.lax.scan(back, behind, (kept, obs), reverse=True)
     return smoothed
 
 

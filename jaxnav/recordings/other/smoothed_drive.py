@@ -1,4 +1,4 @@
-"""The track of a recorded drive by all that was seen: filtered event by event, then smoothed back.
+"""Smooth the track of a recorded drive: filtered event by event, then back from its end.
 
     smoothed = smooth_drive(events, setup)
 
@@ -23,7 +23,7 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.recordings.drive_events import DriveEvents
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.other.smoothed import Behind, Kept, Localised, Packed, smooth_frames
+from jaxnav.recordings.other.smoothed import Kept, Localised, Packed, smooth_chunks
 
 CHUNK_EVENTS = 64
 
@@ -88,17 +88,14 @@ def smooth_drive(
     belief = navigator.init().belief
     filtered, smoothed, kept = [], [], []
     for begin in begins:
-        belief, chunk, told = _filter(navigator, belief, _chunk(events, begin))
-        kept.append(Packed.of(chunk))
-        filtered.append(told)
+        belief, chunk, poses = _filter(navigator, belief, _chunk(events, begin))
+        kept.append(Packed.from_kept(chunk))
+        filtered.append(poses)
         progress(min(CHUNK_EVENTS, total - begin))
-    any_obs = jax.tree.map(lambda leaf: leaf[0], _chunk(events, 0))
-    behind = Behind.nothing(navigator, 1, any_obs)
-    for begin in reversed(begins):
-        obs = _chunk(events, begin)
-        behind, told = smooth_frames(navigator, behind, kept.pop().unpack(), obs)
-        smoothed.append(jax.tree.map(lambda leaf: leaf[:, 0], told))
-        progress(min(CHUNK_EVENTS, total - begin))
+    back = smooth_chunks(navigator, 1, kept, lambda index: _chunk(events, begins[index]))
+    for index, poses in back:
+        smoothed.append(jax.tree.map(lambda leaf: leaf[:, 0], poses))
+        progress(min(CHUNK_EVENTS, total - begins[index]))
     origin_m = setup.markers.origin_m
     return (
         _track(events.stamps_ns, filtered, origin_m),
@@ -114,10 +111,13 @@ def _filter(
 
     def sense(belief: Belief, obs: Observation) -> tuple[Belief, tuple[Kept, Localised]]:
         belief, estimate = navigator.sense(belief, obs)
-        return belief, (Kept.of(belief, estimate), Localised.of(estimate))
+        return belief, (
+            Kept.from_estimate(belief, estimate),
+            Localised.from_estimate(estimate),
+        )
 
-    belief, (kept, told) = jax.lax.scan(sense, belief, obs)
-    return belief, jax.tree.map(lambda leaf: leaf[:, None], kept), told  # one track
+    belief, (kept, poses) = jax.lax.scan(sense, belief, obs)
+    return belief, jax.tree.map(lambda leaf: leaf[:, None], kept), poses  # one track
 
 
 def _chunk(events: DriveEvents, begin: int) -> Observation:
@@ -127,8 +127,8 @@ def _chunk(events: DriveEvents, begin: int) -> Observation:
     obs: Any = jax.tree.map(
         lambda leaf: jnp.asarray(leaf[np.minimum(rows, len(events) - 1)]), events.obs
     )
-    told = obs.visible & known[:, None, None], obs.has_odometry & known, obs.dt_s * known
-    padded: Observation = eqx.tree_at(lambda o: (o.visible, o.has_odometry, o.dt_s), obs, told)
+    shown = obs.visible & known[:, None, None], obs.has_odometry & known, obs.dt_s * known
+    padded: Observation = eqx.tree_at(lambda o: (o.visible, o.has_odometry, o.dt_s), obs, shown)
     return padded
 
 

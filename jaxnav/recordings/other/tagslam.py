@@ -1,4 +1,4 @@
-"""Reading of TagSLAM's folders: bags with detections and results, and three YAML files.
+"""Read TagSLAM's bags of detections, and its folders: such bags with results, and three YAML files.
 
 cameras.yaml       intrinsics (Kalibr's keys), `tagtopic`, `rig_body`
 *.bag[.bz2]        detections; `/tf` with every camera, marker and the rig; `odom_topic`
@@ -10,19 +10,23 @@ camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
 """
 
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
+from jaxnav.core.models.conventions import APRILTAG_FIRST_CORNER
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
-from jaxnav.files import kalibr, poses
+from jaxnav.files import kalibr, limits, poses
 from jaxnav.files.figures import rig_from_figures
 from jaxnav.files.markers import marker_map
-from jaxnav.files.ranges import within
+from jaxnav.files.ranges import is_within, within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.topics import OdometrySigma
 from jaxnav.files.validation import (
@@ -35,13 +39,121 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
-from jaxnav.recordings.other import bags
-from jaxnav.recordings.other.recording import RecordingSource
-from jaxnav.recordings.ros.camera_messages import TAGSLAM
-from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.recordings.other.bags import ReceivedMessage, is_ros1_bag, read_messages
+from jaxnav.recordings.other.recording import Rows, Source, rows_of
+from jaxnav.recordings.ros.camera_messages import TAGSLAM, detections
+from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY, stamp_ns
 from jaxnav.recordings.ros.odometry_track import OdometryTrack
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
+_TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
+_Poses = dict[int, np.ndarray]  # stamp in ns -> (7,) wxyz xyz
+_Edges = dict[tuple[str, str], _Poses]  # (parent, child) -> the child's pose in the parent
+
+
+@dataclass
+class _Bag:
+    """What a bag holds, by its topics."""
+
+    kinds: dict[str, str] = field(default_factory=dict)  # of every topic
+    frames: dict[str, list[tuple[int, Detections]]] = field(default_factory=dict)  # with stamps
+    transforms: _Edges = field(default_factory=dict)
+    odometry: dict[str, _Poses] = field(default_factory=dict)  # of its body in its own frame
+    count: int = 0  # detections
+
+    def take(self, received: ReceivedMessage) -> None:
+        """Take a message."""
+        topic, message = received.topic, received.message
+        if received.kind == TAGSLAM:
+            if len(message.apriltags) > limits.IN_VIEW:
+                raise ValueError(f"a frame of more than {limits.IN_VIEW} detections")
+            found = detections(TAGSLAM, message, APRILTAG_FIRST_CORNER, 1.0, {})
+            self.count += len(found)
+            if self.count > limits.DETECTIONS:
+                raise ValueError(f"more than {limits.DETECTIONS} detections")
+            self.frames.setdefault(topic, []).append((stamp_ns(message), found))
+        elif received.kind == NAV_ODOMETRY:
+            pose = message.pose.pose
+            (row,) = _rigid([(pose.orientation, pose.position)], [f"a pose on {topic}"])
+            self.odometry.setdefault(topic, {})[stamp_ns(message)] = row
+        else:
+            edges = [
+                (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
+                for one in message.transforms
+            ]
+            rows = _rigid(
+                [(one.transform.rotation, one.transform.translation) for one in message.transforms],
+                [f"the transform from {child} to {parent}" for parent, child in edges],
+            )
+            for one, edge, row in zip(message.transforms, edges, rows, strict=True):
+                self.transforms.setdefault(edge, {})[stamp_ns(one)] = row
+
+
+def _rigid(parts: list[tuple[Any, Any]], names: list[str]) -> np.ndarray:
+    """Poses (N, 7) of rotations and positions, which are rigid and in the world."""
+    poses = np.array([(q.w, q.x, q.y, q.z, p.x, p.y, p.z) for q, p in parts], float)
+    poses = poses.reshape(-1, 7)
+    off_unit = np.abs(np.linalg.norm(poses[:, :4], axis=1) - 1)
+    rigid = np.isfinite(poses).all(axis=1) & (off_unit <= 1e-3)
+    near = is_within("position_m", poses[:, 4:]).all(axis=1)
+    for index in np.flatnonzero(~(rigid & near))[:1]:
+        problem = "leads out of the world" if rigid[index] else "is not rigid"
+        raise ValueError(f"{names[index]} {problem}")
+    return poses
+
+
+def _read_bag(path: Path, odometry: str | None = None) -> _Bag:
+    """Read a .bag or .bag.bz2.
+
+    Args:
+        odometry: the topic of odometry that is wanted; what others hold is not looked at.
+    """
+    bag = _Bag()
+
+    def choose(kinds: Any) -> list[str]:
+        bag.kinds = dict(kinds)
+        return [
+            topic
+            for topic, kind in kinds.items()
+            if kind in (TAGSLAM, *_TF_TYPES) or (kind == NAV_ODOMETRY and topic == odometry)
+        ]
+
+    read_messages(path, choose, bag.take)
+    return bag
+
+
+def _listed(recorded: Sequence[_Bag]) -> str:
+    """The topics of some bags, for a message."""
+    topics = sorted({f"{topic} ({kind})" for bag in recorded for topic, kind in bag.kinds.items()})
+    return f"topics found: {', '.join(topics) or 'none'}"
+
+
+def _rows(cameras: Sequence[list[tuple[int, Detections]]]) -> Rows:
+    """One table of the detections by all cameras, which are in the order of the rig."""
+    frames = [(ns, index, found) for index, seen in enumerate(cameras) for ns, found in seen]
+    return rows_of(frames, [ns for ns, *_ in frames], tells_families=False)
+
+
+def read_detection_bag(path: Path, rig: CameraRig, markers: Callable[[], MarkerMap]) -> Source:
+    """Read a bag of detections, in which a rig's cameras are named like the topics.
+
+    Raises:
+        BadInput: the bag is broken, or a camera has no topic or several.
+    """
+    bag = _read_bag(path)
+
+    def frames_of(camera: str) -> list[tuple[int, Detections]]:
+        """Of the topic with the camera's name, or else with that name between two slashes."""
+        topics = [topic for topic in bag.frames if topic.strip("/") == camera.strip("/")]
+        topics = topics or [topic for topic in bag.frames if camera in topic.split("/")]
+        if len(topics) == 1:
+            return bag.frames[topics[0]]
+        problem = f"no topic of {TAGSLAM} belongs to the camera {camera!r}"
+        if topics:
+            problem = f"several topics belong to the camera {camera!r}"
+        raise BadInput(path, f"{problem}; {_listed([bag])}")
+
+    return Source(path.name, _rows([frames_of(name) for name in rig.names]), rig, markers)
 
 
 class _PoseEntry(ForeignEntry):
@@ -81,13 +193,13 @@ class _CameraPoseEntry(ForeignEntry):
     pose: _PoseEntry
 
 
-def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
+def read_tagslam(path: Path, rig: CameraRig | None) -> Source:
     """Read a TagSLAM folder.
 
     Raises:
         BadInput: one line naming file and key.
     """
-    files = [file for file in sorted(path.iterdir()) if bags.is_bag(file)]
+    files = [file for file in sorted(path.iterdir()) if is_ros1_bag(file)]
     names = {file.name for file in files}
     files = [file for file in files if file.name.removesuffix(".bz2") not in names - {file.name}]
     if not files:
@@ -95,19 +207,22 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
     chain = kalibr.camchain(path / "cameras.yaml")
     body = next(iter(chain.values())).rig_body or "rig"
     moves = _body(path, body)
-    topic = None if moves is None else moves.odom_topic
-    recorded = [bags.read_bag(file, topic) for file in files]
-    rows = bags.rows_of_topics(
-        [_detections(path, key, entry, recorded) for key, entry in chain.items()]
-    )
+    recorded = [_read_bag(file, None if moves is None else moves.odom_topic) for file in files]
+    cameras = []
+    for key, entry in chain.items():
+        where = at(path / "cameras.yaml", key, "tagtopic")
+        if entry.tagtopic is None:
+            raise BadInput(where, "missing: on which topic are this camera's detections?")
+        found = [bag.frames for bag in recorded]
+        cameras.append(_only(found, entry.tagtopic, TAGSLAM, where, recorded))
     edges = {edge: stamped for bag in recorded for edge, stamped in bag.transforms.items()}
     rig = rig or _rig(path, chain, edges, body)
     if len(rig) != len(chain):
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
         raise BadInput("--rig", problem)
-    return RecordingSource(
+    return Source(
         path.name,
-        rows,
+        _rows(cameras),
         rig,
         lambda: _markers(path, edges),
         lambda: _reference(edges, body),
@@ -115,31 +230,28 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> RecordingSource:
     )
 
 
-Edges = dict[tuple[str, str], dict[int, tuple[float, ...]]]
+def _only(
+    by_topic: Sequence[dict[str, Any]],
+    topic: str,
+    kind: str,
+    where: str,
+    recorded: Sequence[_Bag],
+) -> Any:
+    """What the one bag that has a topic holds of it."""
+    found = [held[topic] for held in by_topic if topic in held]
+    if len(found) != 1:
+        problem = f"{len(found) or 'no'} bags have {topic} of {kind}"
+        raise BadInput(where, f"{problem}; {_listed(recorded)}")
+    return found[0]
 
 
-def _reference(edges: Edges, body: str) -> dict[int, np.ndarray] | None:
+def _reference(edges: _Edges, body: str) -> _Poses | None:
     reference = {
         stamp: _canonical(pose)
         for (_, child), stamped in edges.items() if child == body
         for stamp, pose in stamped.items()
     }  # fmt: skip
     return reference or None
-
-
-def _detections(
-    path: Path, key: str, entry: kalibr.KalibrCamera, recorded: list[bags.Bag]
-) -> bags.TopicDetections:
-    where = at(path / "cameras.yaml", key, "tagtopic")
-    if entry.tagtopic is None:
-        raise BadInput(where, "missing: on which topic are this camera's detections?")
-    detections = [
-        bag.detections[entry.tagtopic] for bag in recorded if entry.tagtopic in bag.detections
-    ]
-    if len(detections) != 1:
-        problem = f"{len(detections) or 'no'} bags have {entry.tagtopic} of {TAGSLAM}"
-        raise BadInput(where, f"{problem}; {bags.list_topics(recorded)}")
-    return detections[0]
 
 
 def _body(path: Path, body: str) -> _BodyEntry | None:
@@ -151,7 +263,7 @@ def _body(path: Path, body: str) -> _BodyEntry | None:
 
 
 def _odometry(
-    path: Path, body: str, entry: _BodyEntry, recorded: list[bags.Bag]
+    path: Path, body: str, entry: _BodyEntry, recorded: Sequence[_Bag]
 ) -> OdometryTrack | None:
     """The track of the rig's `odom_topic`; None where its entry names none."""
     if entry.odom_topic is None:
@@ -160,13 +272,8 @@ def _odometry(
     where = at(file, f"bodies.{body}")
     if entry.T_body_odom is None:
         raise BadInput(f"{where}.T_body_odom", f"missing: where is the body of {entry.odom_topic}?")
-    tracks = [
-        bag.odometry[entry.odom_topic] for bag in recorded if entry.odom_topic in bag.odometry
-    ]
-    if len(tracks) != 1:
-        problem = f"{len(tracks) or 'no'} bags have {entry.odom_topic} of {NAV_ODOMETRY}"
-        raise BadInput(f"{where}.odom_topic", f"{problem}; {bags.list_topics(recorded)}")
-    (track,) = tracks
+    held = [bag.odometry for bag in recorded]
+    track = _only(held, entry.odom_topic, NAV_ODOMETRY, f"{where}.odom_topic", recorded)
     stamps = sorted(track)
     poses_read = np.array([track[stamp] for stamp in stamps]).reshape(-1, 7)
     whole = OdometryTrack(
@@ -179,7 +286,7 @@ def _by_name(settings: TagSlamFile) -> dict[str, _BodyEntry]:
     return {name: entry for body in settings.bodies for name, entry in body.items()}
 
 
-def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: str) -> CameraRig:
+def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: _Edges, body: str) -> CameraRig:
     cameras = []
     file = path / "camera_poses.yaml"
     written = None
@@ -195,7 +302,7 @@ def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: Edges, body: 
     return rig_from_figures(cameras)
 
 
-def _markers(path: Path, edges: Edges) -> MarkerMap:
+def _markers(path: Path, edges: _Edges) -> MarkerMap:
     """The map: poses from /tf, or else known ones of tagslam.yaml; sizes from tagslam.yaml."""
     file = path / "tagslam.yaml"
     settings = validate(TagSlamFile, read_mapping(file), file)
@@ -232,9 +339,7 @@ def _markers(path: Path, edges: Edges) -> MarkerMap:
     return marker_map(stacked, sizes_m, ids, [_FAMILY] * len(ids))
 
 
-def _to_root(
-    frame: str, parents: dict[str, tuple[str, dict[int, tuple[float, ...]]]]
-) -> np.ndarray:
+def _to_root(frame: str, parents: dict[str, tuple[str, _Poses]]) -> np.ndarray:
     T_root_frame = np.eye(4)
     seen = set()
     while frame in parents and frame not in seen:
@@ -244,10 +349,10 @@ def _to_root(
     return poses.pose_from_matrix(T_root_frame)
 
 
-def _last(stamped: dict[int, tuple[float, ...]]) -> np.ndarray:
+def _last(stamped: _Poses) -> np.ndarray:
     """The latest pose (7,), which TagSLAM published after its last optimisation."""
     return _canonical(stamped[max(stamped)])
 
 
-def _canonical(pose: tuple[float, ...]) -> np.ndarray:
-    return poses.pose_from_matrix(poses.matrix(np.array(pose)))
+def _canonical(pose: np.ndarray) -> np.ndarray:
+    return poses.pose_from_matrix(poses.matrix(pose))

@@ -17,3 +17,8 @@ def message_type(kind: str) -> Any:
     if not hasattr(module, name):
         raise ImportError(f"{package} has no {name}")
     return getattr(module, name)
+
+
+def time_ns(stamp: Any) -> int:
+    """A ROS stamp as ns."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)

@@ -1,4 +1,4 @@
-"""Localise a rig that moves freely from frames that arrive camera by camera, and any odometry.
+"""Localise a rig that moves freely while its frames and any odometry arrive.
 
 Frames of one stamp are one observation. Observations are taken in the order of their stamps, and
 wait for the odometry, so that who comes first changes nothing: what `jaxnav replay` makes of the
@@ -16,9 +16,10 @@ from jaxnav.core.navigator import Navigator, Step
 from jaxnav.core.pose.observation import Observation
 from jaxnav.detection.observe import observe
 from jaxnav.detection.types import Detections
+from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import hide_nowhere
+from jaxnav.drive.pilot import Outcome
 from jaxnav.errors import Containment
-from jaxnav.recordings.ros.estimates import Report, report_of_body
 from jaxnav.recordings.ros.odometry_track import SET_BACK_AFTER, SET_BACK_NS, GrowingTrack
 
 MAX_DT_S = 1.0  # over a longer pause the motion is predicted for one second
@@ -38,18 +39,18 @@ class BodyTracker:
         navigator: Navigator,
         step: Step,
         cameras: int,
-        tell: Callable[[Report], None],
+        publish: Callable[[Outcome], None],
         odometry: GrowingTrack | None = None,
         contained: Containment | None = None,
     ):
         """Args:
         step: compiled `navigator.step`.
         cameras: how many give frames.
-        tell: gets the report of each observation, in the tracker's thread.
+        publish: gets the outcome of each observation, in the tracker's thread.
         odometry: of the rig, by other software, see `add_odometry`; None: there is none.
         contained: of what an observation raises, which is then left out.
         """
-        self._navigator, self._step, self._tell = navigator, step, tell
+        self._navigator, self._step, self._publish = navigator, step, publish
         self._cameras, self._odometry = cameras, odometry
         self._state = navigator.init()
         self._last_ns: int | None = None
@@ -108,8 +109,11 @@ class BodyTracker:
         obs = self._observation(frames, before_ns, stamp_ns)
         self._state, output = self._step(self._state, obs)
         belief = self._state.belief
-        restarts, origin_m = int(belief.restarts), self._navigator.markers.origin_m
-        self._tell(report_of_body(output, belief.bank, restarts, stamp_ns, origin_m))
+        outcome = Outcome(
+            stamp_ns, Health.OK, Fault(0), Reject(0), 0.0, 0.0, output, belief, None, stamp_ns,
+            int(belief.restarts), "", origin_m=self._navigator.markers.origin_m,
+        )  # fmt: skip
+        self._publish(outcome)
 
     def _next(self) -> tuple[int, dict[int, Detections]] | None:
         """The next observation's stamp and frames; None: closed."""
@@ -119,8 +123,8 @@ class BodyTracker:
                     stamp_ns = min(self._sets)
                     came_s, frames = self._sets[stamp_ns]
                     waits_s = came_s + _PATIENCE_S - time.monotonic()
-                    told = self._odometry is None or self._odometry.reaches(stamp_ns)
-                    if (told and len(frames) >= self._cameras) or waits_s <= 0:
+                    known = self._odometry is None or self._odometry.reaches(stamp_ns)
+                    if (known and len(frames) >= self._cameras) or waits_s <= 0:
                         del self._sets[stamp_ns]
                         return stamp_ns, frames
                     self._came.wait(waits_s)

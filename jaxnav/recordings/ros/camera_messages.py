@@ -1,4 +1,4 @@
-"""Conversion of ROS messages of cameras into corners and images.
+"""Convert ROS messages of cameras to corners and images.
 
     apriltag_msgs/AprilTagDetectionArray   apriltag_ros 2: pixels counted from the image's edge
     apriltag_msgs/ApriltagArrayStamped     TagSLAM: pixels as its calibration counts them
@@ -91,13 +91,13 @@ def detections_message(found: Detections, stamp: Any) -> Any:
     )
     order = np.argsort(TL_TR_BR_BL["bottom_left"])
     places_px = found.corners_px[:, order] + APRILTAG_PIXEL_EDGE_PX
-    told = message()
-    told.header.stamp = stamp
-    told.detections = [
+    filled = message()
+    filled.header.stamp = stamp
+    filled.detections = [
         tag(family=family, id=int(i), corners=[point(x=float(x), y=float(y)) for x, y in places])
         for i, family, places in zip(found.ids, found.families, places_px, strict=True)
     ]
-    return told
+    return filled
 
 
 def grey_image(kind: str, message: Any) -> UInt8[np.ndarray, "rows columns"] | None:

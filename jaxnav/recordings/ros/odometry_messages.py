@@ -1,4 +1,4 @@
-"""Conversion of ROS messages into readings of an odometer, without ROS, OpenCV or JAX.
+"""Convert ROS messages to readings of an odometer, without ROS, OpenCV or JAX.
 
 nav_msgs/Odometry                           a car's speed and yaw rate, another base's twist
 geometry_msgs/TwistStamped, TwistWithCovarianceStamped      the same
@@ -14,6 +14,7 @@ from typing import Any
 from jaxnav.core.models.twists import TwistReader
 from jaxnav.drive.interfaces import GyroReading, Odometry, Reading, TwistOdometry
 from jaxnav.files.ranges import RANGES
+from jaxnav.recordings.ros import time_ns
 
 NAV_ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistStamped"
@@ -42,7 +43,7 @@ class WheelJoints:
 
 def stamp_ns(message: Any) -> int:
     """The stamp in a message's header, ns, on the clock of the computer that measured."""
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+    return time_ns(message.header.stamp)
 
 
 def gyro(message: Any, axis: tuple[float, float, float]) -> GyroReading:

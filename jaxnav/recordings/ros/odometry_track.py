@@ -1,4 +1,4 @@
-"""Odometry of a rig that moves freely, by other software: poses in a frame of its own.
+"""Poses of a freely moving rig by other software's odometry, in a frame of its own.
 
 A visual-inertial odometry, a lidar or a T265 tells where its body is in a frame that drifts against
 the map. Only the motion between two times is used of it.

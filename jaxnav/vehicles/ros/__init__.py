@@ -1,1 +1,1 @@
-"""A connection to ROS 2, and what is published there; imported without ROS, JAX or OpenCV."""
+"""A connection to ROS 2, and what is published and listened to there."""

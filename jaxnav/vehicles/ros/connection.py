@@ -14,20 +14,15 @@ of ROS, which is /clock with `sim_time`.
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from jaxnav.errors import BadInput, Containment, libraries_silenced
-from jaxnav.files.figures import CameraFigures
-from jaxnav.files.validation import at
 from jaxnav.recordings.ros import message_type
-from jaxnav.recordings.ros.lenses import CAMERA_INFO, figures_of
 from jaxnav.vehicles.ros.source_clock import SourceClock, SteadyOffset
 
 _QUEUE = 10
-_CAMERA_INFO_S = 10.0  # how long a CameraInfo is waited for
 _LATCHED = 100  # messages of as many publishers
 _WAIT_S = 0.05  # how long the thread sleeps where no message comes
 
@@ -140,7 +135,7 @@ class Connection:
     def every(self, period_s: float, name: str, function: Callable[[], None]) -> None:
         """Call a function again and again, in the thread of `run`."""
         contained = self.contained.of(name, function)
-        self.node.create_timer(period_s, lambda: contained())  # or it would be told the time
+        self.node.create_timer(period_s, lambda: contained())  # or it would be passed the time
 
     def serve(
         self,
@@ -261,37 +256,3 @@ class Connection:
                     return
                 self.contained.note("ROS", error)
                 self._closing.wait(_WAIT_S)
-
-
-def await_lenses(
-    path: Path, topics: Mapping[str, str], rectified: bool, check: Callable[[], None]
-) -> dict[str, CameraFigures]:
-    """Wait for a CameraInfo on each topic.
-
-    Args:
-        path: the file that names the topics, for messages.
-        topics: by the camera's name.
-        check: called again and again; it raises where the wait is called off.
-
-    Raises:
-        BadInput: none comes, or one is no calibrated camera.
-    """
-    came: dict[str, Any] = {}
-    if not topics:
-        return {}
-    connection = Connection("jaxnav_camera_info")
-    try:
-        for name, topic in topics.items():
-            connection.listen(CAMERA_INFO, topic, partial(came.__setitem__, name))
-        connection.run()
-        until_s = time.monotonic() + _CAMERA_INFO_S
-        while len(came) < len(topics):
-            check()
-            if time.monotonic() > until_s:
-                name = next(name for name in topics if name not in came)
-                problem = f"no message on {topics[name]} for {_CAMERA_INFO_S:g} s"
-                raise BadInput(at(path, f"camera_info.{name}"), problem)
-            time.sleep(_WAIT_S)
-    finally:
-        connection.close()
-    return {name: figures_of(topics[name], message, rectified) for name, message in came.items()}

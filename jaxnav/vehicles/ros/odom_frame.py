@@ -1,4 +1,4 @@
-"""Where the odometry believes the base to be: from its own messages, or from tf.
+"""The base's pose in the odometry's frame, from its own messages or from tf.
 
 OdomPose     nav_msgs/Odometry, whose pose is odom -> base
 OdomTf       /tf and /tf_static, where others send it: a filter of the wheels, say
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxnav.files.poses import compose, inverse, pose_from_rotation_vector, rotated
 from jaxnav.files.ranges import is_within
@@ -19,7 +20,7 @@ from jaxnav.vehicles.ros.source_clock import SourceClock
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])  # wxyz xyz
 _STALE_NS = 200_000_000  # an older odometry is not carried on
 _KEPT = 64  # transforms of a frame, of which the estimate's time must lie near the last
-_RATE_NS = 50_000_000  # a frame's motion is told by transforms at least so far apart
+_RATE_NS = 50_000_000  # a frame's motion is known from transforms at least so far apart
 _LONGEST = 8  # frames from base to odom
 
 
@@ -121,15 +122,15 @@ class OdomTf:
                 return T
         return None
 
-    def _add(self, told: Any, is_static: bool) -> None:
-        frame, parent = told.child_frame_id.lstrip("/"), told.header.frame_id.lstrip("/")
-        pose = pose_of(told.transform.translation, told.transform.rotation)
+    def _add(self, stamped: Any, is_static: bool) -> None:
+        frame, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
+        pose = pose_of(stamped.transform.translation, stamped.transform.rotation)
         if pose is None or frame == self._odom:  # above odom stands our own transform
             return
         link = self._links.get(frame)
         if link is None or link.parent != parent:
             link = _Link(parent, self._clock())
-        stamp_ns = link.clock.time_ns(told.header.stamp)
+        stamp_ns = link.clock.time_ns(stamped.header.stamp)
         last_ns = link.held[-1][0] if link.held else None
         if last_ns is not None and (is_static or stamp_ns < last_ns - _STALE_NS):
             link.held.clear()  # said anew, or its clock was set back
@@ -153,23 +154,16 @@ def pose_of(position: Any, orientation: Any) -> np.ndarray | None:
 def _motion(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """The small motion (6,) of which `_moved` makes the way from a pose to another."""
     there = compose(inverse(before), after)
-    w, xyz = there[0], there[1:4]
-    sine = float(np.linalg.norm(xyz))
-    angle = 2 * np.arctan2(sine, abs(w))
-    turn = xyz / sine * angle * np.sign(w or 1.0) if sine > 0 else np.zeros(3)
-    middle = pose_from_rotation_vector((turn / 2).tolist(), [0.0] * 3)
-    return np.concatenate([compose(inverse(middle), there)[4:], turn])
+    turn = Rotation.from_quat(np.roll(there[:4], -1)).as_rotvec()
+    return np.concatenate([compose(inverse(_turned(turn / 2)), there)[4:], turn])
 
 
 def _moved(step: np.ndarray) -> np.ndarray:
     """The pose (7,) after a small motion (6,): a turn, and a way along the turn's middle."""
-    *way_m, x, y, z = step.tolist()
-    angle_rad = math.hypot(x, y, z)
-    # sin(angle / 2) / angle, which tends to 1/2, and that of half the turn
-    whole, half = (
-        math.sin(part * angle_rad / 2) / angle_rad if angle_rad > 0 else part / 2
-        for part in (1.0, 0.5)
-    )
-    middle = math.cos(angle_rad / 4), half * x, half * y, half * z
-    turn = math.cos(angle_rad / 2), whole * x, whole * y, whole * z
-    return np.array([*turn, *rotated(middle, way_m)])
+    way_m, turn = step[:3].tolist(), step[3:]
+    middle = _turned(turn / 2)[:4].tolist()
+    return np.array([*_turned(turn)[:4], *rotated(middle, way_m)])
+
+
+def _turned(turn: np.ndarray) -> np.ndarray:
+    return pose_from_rotation_vector(turn.tolist(), [0.0] * 3)

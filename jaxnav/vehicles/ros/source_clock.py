@@ -1,4 +1,4 @@
-"""When a topic's messages were stamped, on the clock of the program.
+"""Convert the stamps of one topic to the clock of the program.
 
 A source whose stamps are of this computer's clock is believed from then on: stamps that repeat,
 stand still or jump stay what they are, and the pilot refuses them. Stamps of another computer's
@@ -7,6 +7,8 @@ clock, and missing ones, say nothing: there the time is that of arrival.
 
 import time
 from collections.abc import Callable
+
+from jaxnav.recordings.ros import time_ns
 
 _OLDEST_NS = 1_000_000_000  # a message that claims to be older was stamped by another clock
 _BELIEVED_AFTER = 10  # messages in a row with stamps of this clock, after others
@@ -43,23 +45,18 @@ class SourceClock:
 
     def time_ns(self, stamp: object) -> int:
         """The time of a message with this ROS stamp."""
-        stamped_ns = stamp_ns(stamp)
+        stamped_ns = time_ns(stamp)
         if self._offset is None:
             return stamped_ns
         now_ns = time.monotonic_ns()
-        told_ns = stamped_ns + self._offset.ns()
-        is_ours = -_STEP_NS <= now_ns - told_ns <= _OLDEST_NS
+        ours_ns = stamped_ns + self._offset.ns()
+        is_ours = -_STEP_NS <= now_ns - ours_ns <= _OLDEST_NS
         self._in_a_row = self._in_a_row + 1 if is_ours else 0
         if not self._believed:
             first = self._believed is None
             self._believed = self._in_a_row >= (1 if first else _BELIEVED_AFTER)
         if self._believed:
-            return told_ns
+            return ours_ns
         if not stamped_ns or stamped_ns != self._last[0]:
             self._last = stamped_ns, now_ns
         return self._last[1]
-
-
-def stamp_ns(stamp: object) -> int:
-    """A ROS stamp as ns."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)  # type: ignore[attr-defined]

@@ -12,9 +12,8 @@ from jaxnav.cli import main
 from jaxnav.core.filter.odometry import LEARNT, SENSORS_END, SIX, SLIP
 from jaxnav.core.models.vehicle import DEFAULT_SENSOR_SIGMA
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
-from jaxnav.recordings.message_schemas import OUTCOME
-from jaxnav.recordings.outcomes import outcome_message
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import OUTCOME, outcome_message
 from tests.helpers.drives import make_outcome
 from tests.helpers.simulated import make_setup
 from tests.recordings.test_learnt import SIGMA, told_rig, turned

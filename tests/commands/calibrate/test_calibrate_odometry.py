@@ -18,8 +18,8 @@ from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import load_vehicle, save_markers
-from jaxnav.recordings.messages import input_message
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message
 from tests import worlds
 from tests.helpers.odometry_drives import RECIPE, START, TRUTH, sensed, true_track
 from tests.helpers.simulated import make_setup

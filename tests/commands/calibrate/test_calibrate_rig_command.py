@@ -20,9 +20,9 @@ from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.files import load_markers, load_rig, save_markers, save_rig
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.messages import input_message
-from jaxnav.recordings.other.sightings import read_sightings
+from jaxnav.recordings.other.recordings import read_sightings
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import input_message
 from tests.helpers.setups import setup_with
 from tests.helpers.simulated import ROUTE
 

@@ -206,7 +206,7 @@ def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
 
 def test_a_drive_is_its_events_one_by_one():
     log = read_drive(PLAIN)
-    setup = DriveSetup.of_header(log.header, PLAIN)
+    setup = DriveSetup.from_header(log.header, PLAIN)
     events = believed_events(log.inputs, setup)
     recorded = jax.device_get(sequences_of_drive(log, setup, (0, 1), length=30))
     used, obs = recorded.used, recorded.obs
@@ -238,7 +238,7 @@ def test_a_drive_is_its_events_one_by_one():
 
 def test_a_part_that_shows_no_marker_is_refused():
     log = read_drive(PLAIN)
-    setup = DriveSetup.of_header(log.header, PLAIN)
+    setup = DriveSetup.from_header(log.header, PLAIN)
     half = len(log.inputs) // 2
     blind = [dataclasses.replace(given, frames=()) for given in log.inputs[:half]]
     late = dataclasses.replace(log, inputs=[*blind, *log.inputs[half:]])

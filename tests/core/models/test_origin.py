@@ -35,7 +35,7 @@ from jaxnav.pictures.scenery import Scenery
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_replay import Comparison, replay_drive
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
 from tests import worlds
 from tests.helpers.simulated import record, simulated
@@ -135,7 +135,7 @@ def test_what_a_map_counted_from_is_recorded_with_it(double):
             markers = marker_map(T, [0.1, 0.1], [0, 1], ["tag36h11"] * 2, origin_m)
             setup = dataclasses.replace(shifted_setup(FAR_M, double), markers=markers)
             header = json.loads(json.dumps(setup.header()))
-            again = DriveSetup.of_header(header, Path("drive.mcap")).markers
+            again = DriveSetup.from_header(header, Path("drive.mcap")).markers
             assert again.origin_m == origin_m
             now, then = (np.asarray(one.Ts_world_marker.wxyz_xyz) for one in (again, markers))
             np.testing.assert_array_equal(now, then)
@@ -146,7 +146,7 @@ def test_near_zero_a_header_is_what_it_was():
     # As older versions wrote it: in the coordinates of the file.
     header = shifted_setup(FAR_M, True).header()
     del header["origin_m"]
-    assert DriveSetup.of_header(header, Path("a.mcap")).markers.origin_m == ZERO
+    assert DriveSetup.from_header(header, Path("a.mcap")).markers.origin_m == ZERO
 
 
 class Driven:
@@ -199,7 +199,7 @@ def test_a_recording_holds_the_world_and_replays_to_the_bits(away, tmp_path):
     assert np.linalg.norm(log.outcomes.pose[located, :2] - start_m, axis=1).max() < 3
     comparison = Comparison(log)
     with jax.enable_x64(False):
-        setup = DriveSetup.of_header(log.header, path)
+        setup = DriveSetup.from_header(log.header, path)
         for outcome in replay_drive(log.inputs, setup, None):
             comparison.look(outcome)
     assert comparison.first is None
@@ -240,7 +240,8 @@ def test_what_is_drawn_of_a_recording_lies_among_its_markers(away, tmp_path):
     # What Rerun is told, which has float32 alone, is near zero, and the same as while it drives.
     outcome = away.steps[index].outcome
     shown, live = (
-        drawn_m(scenery, *row) for row in ((log.outcomes, index), (Outcomes.of(outcome), 0))
+        drawn_m(scenery, *row)
+        for row in ((log.outcomes, index), (Outcomes.from_outcome(outcome), 0))
     )
     for places_m, live_m in zip(shown, live, strict=True):
         assert np.abs(places_m).max() < 60

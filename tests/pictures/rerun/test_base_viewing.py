@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxnav.core.models.vehicle import SENSOR_ERRORS, TWIST_ERRORS
 from jaxnav.pictures.rerun.scene import RerunScene
-from jaxnav.recordings.outcomes import Outcomes
+from jaxnav.recordings.records import Outcomes
 from tests.helpers.drives import make_outcome
 
 
@@ -22,8 +22,8 @@ def told(outcomes: Outcomes) -> tuple[set[str], list[list[str]]]:
 
 
 def test_a_base_shows_its_twist_and_a_car_its_throttle():
-    car = Outcomes.of(make_outcome(1))
-    base = Outcomes.of(dataclasses.replace(make_outcome(1), twist=(0.1, 0.2, 0.3)))
+    car = Outcomes.from_outcome(make_outcome(1))
+    base = Outcomes.from_outcome(dataclasses.replace(make_outcome(1), twist=(0.1, 0.2, 0.3)))
     of_base = {"plots/forward_mps", "plots/left_mps", "plots/turn_radps"}
     of_car = {"plots/throttle", "plots/steering_rad"}
     plots, names = told(base)

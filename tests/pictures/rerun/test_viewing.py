@@ -26,8 +26,8 @@ from jaxnav.pictures.rerun import view as viewing
 from jaxnav.pictures.rerun.view import RerunView
 from jaxnav.pictures.scenery import Scenery
 from jaxnav.recordings.drive_log import read_drive
-from jaxnav.recordings.outcomes import Outcomes
 from jaxnav.recordings.recorder import Recorder
+from jaxnav.recordings.records import Outcomes
 from tests.helpers.drives import PERIOD_NS, make_outcome, make_picture, record_drive
 
 QCAR = calib_dir() / "qcar"
@@ -99,7 +99,7 @@ def test_a_drive_of_which_nothing_is_known_is_shown_too(tmp_path, capsys):
 
 def test_an_outcome_and_its_record_show_the_same(recorded):
     outcome = make_outcome(4)
-    made, read = Outcomes.of(outcome), read_drive(recorded).outcomes
+    made, read = Outcomes.from_outcome(outcome), read_drive(recorded).outcomes
     for field in dataclasses.fields(Outcomes):
         if field.name != "digest":
             column = getattr(read, field.name)
@@ -155,7 +155,7 @@ def test_what_can_not_be_drawn_is_left_out(tmp_path):
     view.show(dataclasses.replace(make_outcome(0), output=None))
     assert view.dropped == 2
     nowhere = dataclasses.replace(
-        Outcomes.of(make_outcome(1)),
+        Outcomes.from_outcome(make_outcome(1)),
         pose=np.full((1, 3), np.nan),
         covariance=np.full((1, 6, 6), np.nan),
         hypotheses=(np.full((2, 3), np.nan),),

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jaxnav import files
 from jaxnav.errors import BadInput
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from tests.helpers import seed_texts
+from tests.helpers.ros_bags import Bag
 
 DECODED = {"test_5": (2716, 28062, 2715), "test_7": (347, 3235, 347)}  # frames, used, referenced
 FRAMES = {"test_5": 2751, "test_7": 454}
@@ -152,9 +151,6 @@ def test_a_bag_with_a_rig_and_a_map_of_its_own(data_dir, tmp_path):
 
 # --- bags made here -------------------------------------------------------------------------------
 
-_TAG = "uint32 id\nstring family\nuint32 hamming\ngeometry_msgs/Point[] corners\n"
-_TF = "geometry_msgs/TransformStamped[] transforms\n"
-_ARRAY = "std_msgs/Header header\napriltag_msgs/Apriltag[] apriltags\n"
 SQUARE_PX = np.array([[10.0, 30], [30, 30], [30, 10], [10, 10]])  # BL BR TR TL in the image
 Seen = dict[str, list[tuple[int, list[tuple[int, np.ndarray]]]]]
 
@@ -165,58 +161,16 @@ def write_bag(path: Path, seen: Seen, transforms: Any = (), odometry: Any = None
     Args:
         odometry: topic -> [(stamp in ns, wxyz xyz)].
     """
-    types = get_typestore(Stores.ROS1_NOETIC)
-    types.register(get_types_from_msg(_TAG, "apriltag_msgs/msg/Apriltag"))
-    types.register(get_types_from_msg(_ARRAY, "apriltag_msgs/msg/ApriltagArrayStamped"))
-    types.register(get_types_from_msg(_TF, "tf2_msgs/msg/TFMessage"))
-    make = types.types
-
-    def header(stamp_ns: int, frame: str) -> Any:
-        time = make["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
-        return make["std_msgs/msg/Header"](0, time, frame)
-
-    def tag(marker_id: int, corners: np.ndarray) -> Any:
-        points = [make["geometry_msgs/msg/Point"](x, y, 0.0) for x, y in corners]
-        return make["apriltag_msgs/msg/Apriltag"](marker_id, "", 0, points)
-
-    with Writer(path) as writer:
-        kind = "apriltag_msgs/msg/ApriltagArrayStamped"
-        for topic, messages in seen.items():
-            connection = writer.add_connection(topic, kind, typestore=types)
-            for stamp, tags in messages:
-                message = make[kind](header(stamp, "camera"), [tag(*one) for one in tags])
-                writer.write(connection, stamp, types.serialize_ros1(message, kind))
-        if transforms:
-            kind = "tf2_msgs/msg/TFMessage"
-            connection = writer.add_connection("/tf", kind, typestore=types)
-            for parent, child, (w, x, y, z, *position) in transforms:
-                transform = make["geometry_msgs/msg/Transform"](
-                    make["geometry_msgs/msg/Vector3"](*position),
-                    make["geometry_msgs/msg/Quaternion"](x, y, z, w),
-                )
-                stamped = make["geometry_msgs/msg/TransformStamped"](
-                    header(5, parent), child, transform
-                )
-                raw = types.serialize_ros1(make[kind]([stamped]), kind)
-                writer.write(connection, 5, raw)
-        kind, still = "nav_msgs/msg/Odometry", make["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-        for topic, poses in (odometry or {}).items():
-            connection = writer.add_connection(topic, kind, typestore=types)
-            for stamp, (w, x, y, z, *position) in poses:
-                pose = make["geometry_msgs/msg/Pose"](
-                    make["geometry_msgs/msg/Point"](*position),
-                    make["geometry_msgs/msg/Quaternion"](x, y, z, w),
-                )
-                message = make[kind](
-                    header(stamp, "odom"),
-                    "body",
-                    make["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
-                    make["geometry_msgs/msg/TwistWithCovariance"](
-                        make["geometry_msgs/msg/Twist"](still, still), np.zeros(36)
-                    ),
-                )
-                writer.write(connection, stamp, types.serialize_ros1(message, kind))
-    return path
+    bag = Bag("bag")
+    for topic, messages in seen.items():
+        for stamp, tags in messages:
+            bag.tagslam(topic, stamp, stamp, tags)
+    for parent, child, pose in transforms:
+        bag.transform(5, parent, child, pose)
+    for topic, poses in (odometry or {}).items():
+        for stamp, pose in poses:
+            bag.odometry(topic, stamp, stamp, 0.0, 0.0, pose)
+    return bag.write(path.parent).rename(path)
 
 
 @pytest.fixture
@@ -436,10 +390,10 @@ def test_broken_bags_are_one_line_and_leave_nothing_behind(tmp_path, rig, marker
     packed.write_bytes(raw)
     assert "packed.bag.bz2: can't be decompressed" in problem(packed, rig, markers)
     packed.write_bytes(bz2.compress(b"no bag"))
-    assert "packed.bag.bz2: is not a readable ROS 1 bag" in problem(packed, rig, markers)
+    assert "packed.bag.bz2: is not a readable ROS bag" in problem(packed, rig, markers)
     for length in (0, 5, 2000, len(raw) // 2, len(raw) - 3):
         (tmp_path / "cut.bag").write_bytes(raw[:length])
-        assert "cut.bag: is not a readable ROS 1 bag" in problem(tmp_path / "cut.bag", rig, markers)
+        assert "cut.bag: is not a readable ROS bag" in problem(tmp_path / "cut.bag", rig, markers)
     assert list(scratch.iterdir()) == []
 
 

@@ -9,7 +9,7 @@ from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.interfaces import GyroReading, TwistOdometry
 from jaxnav.errors import BadInput
-from jaxnav.recordings.other.ros_drives import read_ros_drive
+from jaxnav.recordings.other.ros import read_ros_drive
 from tests.helpers.ros_bags import Bag
 from tests.helpers.ros_drives import BEGIN_NS, MS, SQUARE_PX, topic_map
 from tests.worlds import qcar, qcar_rig, room_markers

@@ -11,7 +11,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.recordings.other.recordings import read_recording
-from jaxnav.recordings.other.ros_drives import TOGETHER_NS, join_frames, read_ros_drive
+from jaxnav.recordings.other.ros import TOGETHER_NS, join_frames, read_ros_drive
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import (
     BEGIN_NS,

@@ -1,9 +1,13 @@
 """ROS bags and topic maps that do not fit or are broken give a one-line error, or a result."""
 
+import bz2
 import time
 
+import lz4.frame
 import numpy as np
 import pytest
+from rosbags.rosbag1.reader import decompressors
+from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.errors import BadInput
@@ -109,3 +113,9 @@ def test_broken_bags_are_one_line_or_a_result(tmp_path, kind):
         outcomes["read" if refusal is None else "refused"] += 1
     assert outcomes["refused"] >= 10
     assert outcomes["read"] >= 1
+
+
+def test_who_reads_a_bag_by_rosbags_alone_has_no_budget():
+    data = bytes(100 * 2**20)
+    assert decompressors["bz2"](bz2.compress(data)) == data
+    assert DECOMPRESSORS["lz4"](lz4.frame.compress(data), len(data)) == data

@@ -16,8 +16,8 @@ from jaxnav.core.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
 from jaxnav.core.models.imu import CONSUMER, TACTICAL
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
+from jaxnav.recordings.other.recordings import read_recording
 from jaxnav.recordings.other.replay import motion_of, replay
-from jaxnav.recordings.other.ros_rigs import read_ros_rig
 from jaxnav.sim.hand_held import HandHeld, imu_samples, observe
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import BEGIN_NS, MS, SQUARE_PX, topic_map
@@ -60,7 +60,7 @@ def small_bag(kind: str) -> Bag:
 @pytest.mark.parametrize("kind", FORMATS)
 def test_frames_and_samples_come_back(tmp_path, kind):
     path, topics = small_bag(kind).write(tmp_path), topic_map(tmp_path, TOPICS)
-    recording = read_ros_rig(path, topics, qcar_rig(), room_markers())
+    recording = read_recording(path, qcar_rig(), room_markers(), topics)
     np.testing.assert_array_equal(recording.stamps_ns, BEGIN_NS + np.array([20, 120]) * MS)
     front, left = (recording.rig.names.index(name) for name in ("front", "left"))
     np.testing.assert_array_equal(recording.seen_at.T, sorted([[0, front, 2], [0, left, 0]]))
@@ -88,7 +88,7 @@ def test_frames_and_samples_come_back(tmp_path, kind):
 
 def test_kalibr_s_figures_go_by_name(tmp_path):
     path, topics = small_bag("mcap").write(tmp_path), topic_map(tmp_path, KALIBR)
-    recording = read_ros_rig(path, topics, qcar_rig(), room_markers())
+    recording = read_recording(path, qcar_rig(), room_markers(), topics)
     noise = recording.imu.noise
     assert noise == dataclasses.replace(
         CONSUMER,
@@ -138,7 +138,7 @@ def test_topics_that_do_not_fit_are_one_line(tmp_path):
     ):
         topics = topic_map(tmp_path, TOPICS.replace("topic: /imu", f"topic: {topic}"))
         with pytest.raises(BadInput) as caught:
-            read_ros_rig(path, topics, qcar_rig(), room_markers())
+            read_recording(path, qcar_rig(), room_markers(), topics)
         assert message in str(caught.value)
     bag = Bag("mcap")
     bag.apriltags("/front/detections", BEGIN_NS, BEGIN_NS, [])
@@ -146,7 +146,7 @@ def test_topics_that_do_not_fit_are_one_line(tmp_path):
     (tmp_path / "short").mkdir()
     topics = topic_map(tmp_path, TOPICS.replace(", left: /left/tags", ""))
     with pytest.raises(BadInput, match="has 1 samples: 2 are needed"):
-        read_ros_rig(bag.write(tmp_path / "short"), topics, qcar_rig(), room_markers())
+        read_recording(bag.write(tmp_path / "short"), qcar_rig(), room_markers(), topics)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def bag_of(walk) -> Bag:
 def test_a_walk_goes_on_by_the_imu_where_no_marker_is_in_view(walk, tmp_path):
     """And without it ends elsewhere."""
     topics = topic_map(tmp_path, TOPICS)
-    recording = read_ros_rig(bag_of(walk).write(tmp_path), topics, qcar_rig(), room_markers())
+    recording = read_recording(bag_of(walk).write(tmp_path), qcar_rig(), room_markers(), topics)
     truth = walk[1].T_world_vehicle_true.translation()
     off_m = []
     for one in (recording, dataclasses.replace(recording, imu=None)):

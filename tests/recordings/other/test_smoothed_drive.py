@@ -27,7 +27,7 @@ def tracks() -> tuple[DriveTrack, DriveTrack, np.ndarray]:
         return [] if hidden and given.frames else [given]
 
     steps = simulated(setup, 4.0, rates=Rates(0.04, 1 / 15), change=change)
-    events = DriveEvents.of([step.input for step in steps], setup, FOLDER)
+    events = DriveEvents.from_inputs([step.input for step in steps], setup, FOLDER)
     done: list[int] = []
     filtered, smoothed = smooth_drive(events, setup, done.append)
     assert sum(done) == 2 * len(events)

@@ -1,7 +1,5 @@
 """What ROS is told of an estimate, against samples that are moved one by one."""
 
-from types import SimpleNamespace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,16 +10,15 @@ import pytest
 from jaxnav.core.models.geometry import cayley
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
-from jaxnav.files.poses import compose, inverse, matrix
-from jaxnav.recordings.ros.estimates import report_of_body, report_of_drive
+from jaxnav.drive.flags import Fault, Health, Reject
+from jaxnav.drive.pilot import Outcome
+from jaxnav.recordings.ros.estimates import base_hypotheses, base_pose_covariance, base_twist
 from jaxnav.vehicles.conformance.lockstep import Step
-from jaxnav.vehicles.ros.odom_frame import OdomPose
 from tests.helpers.simulated import make_setup, simulated
 from tests.worlds import paper_markers, qcar_rig
 
 BASE_X_M = -0.128
 SAMPLES = 100_000
-ZERO = (0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -40,43 +37,39 @@ def close(found: np.ndarray, expected: np.ndarray) -> None:
 
 def test_pose_and_twist_are_those_of_the_base(steps):
     outcome = steps[-1].outcome
-    report = report_of_drive(outcome, BASE_X_M)
+    pose, _ = base_pose_covariance(outcome, BASE_X_M)
     x_m, y_m, psi_rad = outcome.pose
     ahead = np.array([np.cos(psi_rad), np.sin(psi_rad)])
-    np.testing.assert_allclose(report.T_map_base[4:6], [x_m, y_m] + BASE_X_M * ahead, atol=1e-6)
-    assert 2 * np.arctan2(report.T_map_base[3], report.T_map_base[0]) == pytest.approx(psi_rad)
+    np.testing.assert_allclose(pose[4:6], [x_m, y_m] + BASE_X_M * ahead, atol=1e-6)
+    assert 2 * np.arctan2(pose[3], pose[0]) == pytest.approx(psi_rad)
     vx_mps, vy_mps, rate_radps = outcome.output.velocity
     forward_mps = ahead @ [vx_mps, vy_mps]
     left_mps = np.array([-ahead[1], ahead[0]]) @ [vx_mps, vy_mps]
     expected = [forward_mps, left_mps + BASE_X_M * rate_radps, 0, 0, 0, rate_radps]
-    np.testing.assert_allclose(report.twist, expected, atol=1e-6)
-    assert report.decided
-    assert report.is_finite
-    assert report.health == outcome.health.name
+    np.testing.assert_allclose(base_twist(outcome, BASE_X_M)[0], expected, atol=1e-6)
 
 
 def test_the_covariance_of_the_base_is_that_of_moved_samples(steps):
     outcome = steps[-1].outcome
-    report = report_of_drive(outcome, 2.0)
+    _, covariance = base_pose_covariance(outcome, 2.0)
     poses = sampled(np.asarray(outcome.output.pose, float), outcome.output.pose_covariance)
     psi_rad = poses[:, 2]
     places = poses[:, :2] + 2.0 * np.stack([np.cos(psi_rad), np.sin(psi_rad)], axis=1)
     planar = np.ix_([0, 1, 5], [0, 1, 5])
-    close(report.covariance[planar], np.cov(np.column_stack([places, psi_rad]).T))
-    assert np.all(np.linalg.eigvalsh(report.covariance) > 0)
+    close(covariance[planar], np.cov(np.column_stack([places, psi_rad]).T))
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
 def test_the_hypotheses_come_heaviest_first_and_weigh_one(steps):
     undecided = next(step.outcome for step in steps if len(_alive(step)) > 1)
-    held = report_of_drive(undecided, 0.0).hypotheses()
-    assert len(held.weight) == len(_alive_of(undecided))
-    assert np.all(np.diff(held.weight) <= 0)
-    assert np.sum(held.weight) == pytest.approx(1)
+    poses, _, weight = base_hypotheses(undecided, 0.0)
+    assert len(weight) == len(_alive_of(undecided))
+    assert np.all(np.diff(weight) <= 0)
+    assert np.sum(weight) == pytest.approx(1)
     # They are those of the last data, the pose is the present one: the car drives 0.5 m/s.
-    np.testing.assert_allclose(held.T_map_base[0, 4:6], undecided.pose[:2], atol=0.01)
-    nobody = report_of_drive(steps[0].outcome, 0.0)
+    np.testing.assert_allclose(poses[0, 4:6], undecided.pose[:2], atol=0.01)
     if not _alive(steps[0]):
-        assert len(nobody.hypotheses().weight) == 0
+        assert len(base_hypotheses(steps[0].outcome, 0.0)[2]) == 0
 
 
 def _alive(step: Step) -> list[int]:
@@ -103,49 +96,17 @@ def test_a_free_body_s_covariance_is_in_the_axes_of_the_map():
         lambda b: (b.mean, b.covariance, b.initialised), bank, (mean, covariance, initialised)
     )
     output = eqx.tree_at(lambda o: (o.T_world_vehicle, o.covariance), output, (T, P))
-    report = report_of_body(output, bank, 0, 5, ZERO)
-    np.testing.assert_allclose(report.T_map_base, T.wxyz_xyz, atol=1e-6)
-    np.testing.assert_allclose(report.twist, np.arange(6.0), atol=1e-6)
+    belief = eqx.tree_at(lambda b: b.bank, state.belief, bank)
+    nothing_wrong = Health.OK, Fault(0), Reject(0)
+    outcome = Outcome(5, *nothing_wrong, 0.0, 0.0, output, belief, None, 5, 0, "")
+    pose, pose_covariance = base_pose_covariance(outcome, 0.0)
+    np.testing.assert_allclose(pose, T.wxyz_xyz, atol=1e-6)
+    np.testing.assert_allclose(base_twist(outcome, 0.0)[0], np.arange(6.0), atol=1e-6)
     errors = jnp.asarray(sampled(np.zeros(6), np.asarray(P, float)[:6, :6]))
     moved = jax.vmap(lambda xi: (T @ cayley(xi)).translation())(errors)
     turn = T.rotation()
     turned = jax.vmap(lambda xi: (turn @ cayley(xi).rotation() @ turn.inverse()).log())(errors)
     expected = np.cov(np.column_stack([moved, turned]).T)
-    close(report.covariance, expected)
-    (held,) = report.hypotheses().covariance
+    close(pose_covariance, expected)
+    (held,) = base_hypotheses(outcome, 0.0)[1]
     close(held, expected)
-
-
-class Message:
-    """A nav_msgs/Odometry of a pose (7,) wxyz_xyz and a twist (6,)."""
-
-    def __init__(self, pose: np.ndarray, twist: np.ndarray):
-        w, x, y, z, *xyz = pose.tolist()
-        orientation = SimpleNamespace(w=w, x=x, y=y, z=z)
-        position = SimpleNamespace(**dict(zip("xyz", xyz, strict=True)))
-        self.pose = SimpleNamespace(
-            pose=SimpleNamespace(position=position, orientation=orientation)
-        )
-        linear, angular = (
-            SimpleNamespace(**dict(zip("xyz", part.tolist(), strict=True)))
-            for part in (twist[:3], twist[3:])
-        )
-        self.twist = SimpleNamespace(twist=SimpleNamespace(linear=linear, angular=angular))
-
-
-def test_the_odometry_s_pose_is_carried_on_along_its_arc():
-    odom, start = OdomPose(), np.array([1.0, 0, 0, 0, 1.0, 2.0, 0])
-    assert odom.at(5) is None
-    odom.add(10**9, Message(start, np.array([0.5, 0, 0, 0, 0, 2.0])))
-    found = odom.at(10**9 + 100_000_000)
-    angle = 0.2
-    there = [1 + 0.25 * np.sin(angle), 2 + 0.25 * (1 - np.cos(angle)), 0]
-    # The chord is taken as long as the arc: 0.2 % off.
-    np.testing.assert_allclose(found[4:], there, atol=2e-4)
-    np.testing.assert_allclose(matrix(found)[:2, 0], [np.cos(angle), np.sin(angle)], atol=1e-12)
-    np.testing.assert_allclose(odom.at(0), start)  # never back in time
-    held = odom.at(10**9 + 200_000_000)
-    np.testing.assert_array_equal(odom.at(10**10), held)  # no further than it may be trusted
-    odom.add(2 * 10**9, Message(np.full(7, np.nan), np.zeros(6)))
-    np.testing.assert_array_equal(odom.at(10**10), held)
-    np.testing.assert_allclose(compose(inverse(held), held), [1, 0, 0, 0, 0, 0, 0], atol=1e-12)

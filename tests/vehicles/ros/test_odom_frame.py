@@ -1,12 +1,14 @@
-"""odom -> base out of tf, through frames between them."""
+"""odom -> base out of the odometry's messages, or out of tf through frames between them."""
 
 from types import SimpleNamespace
 
+import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 
 from jaxnav.files.poses import compose, inverse, matrix, pose_from_rotation_vector
-from jaxnav.vehicles.ros.odom_frame import OdomTf
+from jaxnav.vehicles.ros.odom_frame import OdomPose, OdomTf
 from jaxnav.vehicles.ros.source_clock import SourceClock
 
 MOUNT = pose_from_rotation_vector([0.0, 0.0, 0.3], [0.1, 0.0, 0.2])
@@ -98,3 +100,53 @@ def test_a_clock_that_was_set_back_begins_anew(odom):
     odom.take(message(transform("odom", "base_link", MOUNT, 100.0)))
     odom.take(message(transform("odom", "base_link", on_the_arc(1.0), 1.0)))
     np.testing.assert_allclose(odom.at(10**9), on_the_arc(1.0), atol=1e-12)
+
+
+# --- the odometry's own messages ---
+
+
+def odometry(pose: np.ndarray, twist: np.ndarray) -> SimpleNamespace:
+    """A nav_msgs/Odometry of a pose (7,) wxyz_xyz and a twist (6,)."""
+    placed = transform("", "", pose, 0.0).transform
+    pose_of = SimpleNamespace(position=placed.translation, orientation=placed.rotation)
+    linear, angular = (
+        SimpleNamespace(**dict(zip("xyz", part.tolist(), strict=True)))
+        for part in (twist[:3], twist[3:])
+    )
+    twist_of = SimpleNamespace(linear=linear, angular=angular)
+    return SimpleNamespace(
+        pose=SimpleNamespace(pose=pose_of), twist=SimpleNamespace(twist=twist_of)
+    )
+
+
+def test_the_odometry_s_pose_is_carried_on_along_its_arc():
+    odom, start = OdomPose(), np.array([1.0, 0, 0, 0, 1.0, 2.0, 0])
+    assert odom.at(5) is None
+    odom.add(10**9, odometry(start, np.array([0.5, 0, 0, 0, 0, 2.0])))
+    found = odom.at(10**9 + 100_000_000)
+    angle = 0.2
+    there = [1 + 0.25 * np.sin(angle), 2 + 0.25 * (1 - np.cos(angle)), 0]
+    # The chord is taken as long as the arc: 0.2 % off.
+    np.testing.assert_allclose(found[4:], there, atol=2e-4)
+    np.testing.assert_allclose(matrix(found)[:2, 0], [np.cos(angle), np.sin(angle)], atol=1e-12)
+    np.testing.assert_allclose(odom.at(0), start)  # never back in time
+    held = odom.at(10**9 + 200_000_000)
+    np.testing.assert_array_equal(odom.at(10**10), held)  # no further than it may be trusted
+    odom.add(2 * 10**9, odometry(np.full(7, np.nan), np.zeros(6)))
+    np.testing.assert_array_equal(odom.at(10**10), held)
+    np.testing.assert_allclose(compose(inverse(held), held), [1, 0, 0, 0, 0, 0, 0], atol=1e-12)
+
+
+def test_a_body_elsewhere_on_the_base_is_taken_for_it():
+    """A nav_msgs/Odometry tells pose and twist of its own body."""
+    T_base_body = jaxlie.SE3.exp(jnp.asarray([0.1, -0.2, 0.05, 0.5, 1.0, -0.3]))
+    T_odom_base = jaxlie.SE3.exp(jnp.asarray([3.0, 1.0, -2.0, 0.1, 0.4, 2.0]))
+    twist = jnp.asarray([0.2, 0.05, 0.0, 0.0, 0.1, 0.2])
+    odom = OdomPose(np.asarray(T_base_body.wxyz_xyz))
+    of_body = np.asarray(T_base_body.inverse().adjoint() @ twist)
+    odom.add(0, odometry(np.asarray((T_odom_base @ T_base_body).wxyz_xyz), of_body))
+    for late_s in (0.0, 0.1):
+        expected = np.asarray((T_odom_base @ jaxlie.SE3.exp(twist * late_s)).wxyz_xyz)
+        away = compose(inverse(odom.at(round(late_s * 1e9))), expected)
+        # The way is taken along the turn's middle.
+        assert np.linalg.norm(away[1:]) < 2e-5

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxnav.errors import BadInput
-from jaxnav.recordings.ros.lenses import figures_of, with_lenses
+from jaxnav.vehicles.ros.lenses import read_lens, with_lenses
 from tests.worlds import qcar_rig
 
 K = [400.0, 0.0, 310.0, 0.0, 410.0, 230.0, 0.0, 0.0, 1.0]
@@ -26,18 +26,18 @@ def info(**changes) -> SimpleNamespace:
 
 
 def test_an_image_as_it_comes_has_k_and_d():
-    lens = figures_of("/front/camera_info", info(), rectified=False)
+    lens = read_lens("/front/camera_info", info(), rectified=False)
     assert (lens.lens, lens.focal_px, lens.center_px) == ("radtan", (400.0, 410.0), (310.0, 230.0))
     np.testing.assert_allclose(lens.distortion[:4], [-0.3, 0.1, 0.001, -0.002])
     assert lens.image_size_px == (640, 480)
     wide = info(distortion_model="equidistant", d=[0.1, 0.2, 0.3, 0.4])
-    assert figures_of("/front", wide, rectified=False).lens == "equidistant"
-    ideal = figures_of("/front", info(distortion_model="", d=[]), rectified=False)
+    assert read_lens("/front", wide, rectified=False).lens == "equidistant"
+    ideal = read_lens("/front", info(distortion_model="", d=[]), rectified=False)
     assert set(ideal.distortion) == {0.0}
 
 
 def test_a_rectified_image_has_p_and_no_distortion():
-    lens = figures_of("/front/camera_info", info(), rectified=True)
+    lens = read_lens("/front/camera_info", info(), rectified=True)
     assert (lens.focal_px, lens.center_px) == ((380.0, 390.0), (305.0, 225.0))
     assert set(lens.distortion) == {0.0}
 
@@ -53,12 +53,12 @@ def test_a_rectified_image_has_p_and_no_distortion():
 )
 def test_a_camera_that_is_not_calibrated_is_named(changes, rectified, expected):
     with pytest.raises(BadInput, match=expected):
-        figures_of("/front/camera_info", info(**changes), rectified)
+        read_lens("/front/camera_info", info(**changes), rectified)
 
 
 def test_the_rig_keeps_all_else():
     rig = qcar_rig()
-    lens = figures_of("/front/camera_info", info(), rectified=False)
+    lens = read_lens("/front/camera_info", info(), rectified=False)
     changed = with_lenses(rig, {"rear": lens})
     at = rig.names.index("rear")
     assert changed.names == rig.names
