@@ -4,11 +4,10 @@
     python benchmarks/bench_simulate.py --accelerator
     pytest benchmarks/bench_simulate.py --benchmark-enable --benchmark-only
 
-The paper's scenario at corner noise of 1 px. A step counts if its drive is still under way. Few
-drives run under `vmap` (as all did once), many through `over_lanes`; both in one process, in turns.
-CPU time is that of all threads: on a shared machine it is more reliable than the clock.
+The paper's scenario at corner noise of 1 px. A step counts if its drive is still under way. CPU
+time is that of all threads: on a shared machine it is more reliable than the clock.
 
-With `--accelerator` the drives run under `vmap` on JAX's default device, many lanes at once.
+With `--accelerator` all drives run side by side on JAX's default device.
 """
 
 import platform
@@ -26,11 +25,11 @@ from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.files.configuration import configure
-from jaxnav.sim.rollout import Rollout, nothing
+from jaxnav.sim.rollout import Rollout
 from jaxnav.sim.scenarios import scenarios
 
 SELECTORS = ("paper-cost", "lowest-reprojection", "multi-hypothesis")
-FEW, MANY, ROUNDS = 256, 4096, 3
+FEW, MANY, ROUNDS = 100, 2048, 3
 ACCELERATOR_LANES = (1024, 8192, 32768)
 
 
@@ -59,17 +58,6 @@ def timed(drives: Rollout, seeds: int) -> tuple[float, float, int]:
     return time.perf_counter() - clock, time.process_time() - cpu, steps
 
 
-def start(drives: Rollout, chunks: int = 1) -> float:
-    """Steps a second of one thread in the first second, when the bank is full."""
-    worlds = drives.start(_keys(drives.many_lanes))
-    jax.block_until_ready(drives._advance_many(worlds, nothing))  # compiled for this thread
-    begin = time.perf_counter()
-    for _ in range(chunks):
-        worlds, _ = drives._advance_many(worlds, nothing)
-    jax.block_until_ready(worlds)
-    return drives.many_lanes * drives.chunk_frames * chunks / (time.perf_counter() - begin)
-
-
 def on_accelerator() -> None:
     """Print a table of steps a second under `vmap`, by the number of lanes."""
     configure(float64=False)
@@ -78,7 +66,7 @@ def on_accelerator() -> None:
     print("| selector | lanes | steps/s | s to compile |\n|---|---|---|---|", flush=True)
     for selector in SELECTORS:
         for lanes in ACCELERATOR_LANES:
-            drives = rollout(selector, many=sys.maxsize, lanes=lanes)
+            drives = rollout(selector)
             first = timed(drives, lanes)[0]
             clock, _, steps = np.transpose([timed(drives, lanes) for _ in range(ROUNDS)])
             compiling = first - np.median(clock)
@@ -92,25 +80,21 @@ def main() -> None:
     jax.config.update("jax_enable_compilation_cache", False)
     many = int(sys.argv[sys.argv.index("--seeds") + 1]) if "--seeds" in sys.argv else MANY
     print(
-        f"jax {jax.__version__}, {platform.processor() or platform.machine()}, "
-        f"{rollout('paper-cost').threads} cores, float32, {many} drives\n\n"
-        "| selector | steps/s, `vmap` | steps/s | CPU us a step, `vmap` | CPU us a step | "
-        "steps/s in the first second, one thread | compile s, `vmap` | compile s |\n"
-        "|---|---|---|---|---|---|---|---|",
+        f"jax {jax.__version__}, {platform.processor() or platform.machine()}, float32\n\n"
+        "| selector | drives | steps/s | CPU us a step | CPU s to compile |\n|---|---|---|---|---|",
         flush=True,
     )
     for selector in SELECTORS:
-        pair = [(rollout(selector, many=sys.maxsize), FEW), (rollout(selector, many=1), many)]
-        cold = [timed(drives, seeds)[0] for drives, seeds in pair]
-        rounds = [[timed(drives, seeds) for drives, seeds in pair] for _ in range(ROUNDS)]
-        clock, cpu, steps = np.moveaxis(np.asarray(rounds), 2, 0)
-        rate, cost = np.median(steps / clock, 0), np.median(cpu / steps, 0) * 1e6
-        compiling = np.asarray(cold) - np.median(clock, 0)
-        print(
-            f"| {selector} | {rate[0]:,.0f} | {rate[1]:,.0f} | {cost[0]:.0f} | {cost[1]:.0f} | "
-            f"{start(pair[1][0]):,.0f} | {compiling[0]:.0f} | {compiling[1]:.0f} |",
-            flush=True,
-        )
+        drives = rollout(selector)
+        for count in (FEW, many):
+            cold = timed(drives, count)[1]
+            clock, cpu, steps = np.transpose([timed(drives, count) for _ in range(ROUNDS)])
+            print(
+                f"| {selector} | {count} | {np.median(steps / clock):,.0f} | "
+                f"{np.median(cpu / steps) * 1e6:.0f} | {cold - np.median(cpu):.0f} |",
+                flush=True,
+            )
+            jax.clear_caches()
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\npeak memory of all together {peak_mib:.0f} MiB")
 
@@ -118,7 +102,7 @@ def main() -> None:
 @pytest.mark.parametrize("selector", SELECTORS)
 def test_whole_drives(benchmark: Any, selector: str) -> None:
     """A round is a thousand drives."""
-    drives = rollout(selector, many=1)
+    drives = rollout(selector)
     drives.run(_keys(8))
     trace = benchmark.pedantic(drives.run, (_keys(1024),), rounds=3)
     benchmark.extra_info["steps a second"] = np.sum(trace.active) / benchmark.stats["median"]

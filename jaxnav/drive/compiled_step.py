@@ -1,14 +1,12 @@
 """Compile a navigator's functions once on a machine: `Navigator.step`, and others."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
 from jax.tree_util import PyTreeDef
 from jaxtyping import PyTree
 
@@ -16,7 +14,6 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.core.navigator import Navigator, Step, jitted_step
 from jaxnav.files import executables
-from jaxnav.files.executable_bytes import Run
 
 
 def compiled_step(navigator: Navigator, folder: Path | None) -> Step:
@@ -47,11 +44,11 @@ def compile_or_load(
         The function of the further trees, with the navigator bound.
     """
     navigator = strip_static(navigator)
-    if folder is None or not all(_is_ours(part) for part in _parts(navigator)):
+    if folder is None or not executables.all_ours(navigator):
         return partial(_jitted(function), navigator)
     numbers = [jnp.asarray(number) for number in jax.tree.leaves(navigator)]
     # A program for each structure of the arguments.
-    ready: dict[PyTreeDef, tuple[Run, PyTreeDef]] = {}
+    ready: dict[PyTreeDef, tuple[executables.Run, PyTreeDef]] = {}
 
     def call(*arguments: PyTree) -> PyTree:
         leaves, given = jax.tree.flatten(arguments)
@@ -96,19 +93,3 @@ def strip_static(navigator: Navigator) -> Navigator:
 def _jitted(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """`jax.jit(function)`, cached: one program for all navigators of a structure."""
     return jax.jit(function)
-
-
-def _is_ours(part: object) -> bool:
-    return isinstance(part, jaxlie.MatrixLieGroup) or type(part).__module__.startswith("jaxnav.")
-
-
-def _parts(module: object) -> Iterator[object]:
-    """Yield a module and all modules inside it."""
-    yield module
-    parts = jax.tree.leaves(
-        list(vars(module).values()) if isinstance(module, eqx.Module) else [],
-        is_leaf=lambda part: isinstance(part, eqx.Module | jaxlie.MatrixLieGroup),
-    )
-    for part in parts:
-        if isinstance(part, eqx.Module | jaxlie.MatrixLieGroup):
-            yield from _parts(part)

@@ -11,22 +11,26 @@ loading an executable. So the executable itself is kept.
 
 import hashlib
 import os
+import pickle
 import platform
 import re
 import time
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from functools import cache, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
 from jax.tree_util import PyTreeDef
+from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from jaxnav.files.executable_bytes import NotStorableError, Run, from_bytes, to_bytes
 from jaxnav.files.private import NotPrivateError, PrivateFolder
 
 _KEPT = 64  # the last used executables, some MB each, are kept
@@ -39,6 +43,9 @@ _WITHOUT = (
 PACKAGE = Path(__file__).resolve().parents[1]
 ASKED = "/jaxnav/executables/asked"  # JAX's listeners hear of it as of a compilation
 
+_CHECKSUM_BYTES = 32  # at the beginning of a file: of all that follows
+
+Run = Callable[[Sequence[ArrayLike]], list[jax.Array]]
 _folders: list[Path] = []  # the last one counts
 
 
@@ -59,18 +66,36 @@ class kept:
     def __init__(self, function: Callable[..., PyTree]):
         self.jitted = jax.jit(function)
         self._function = function
-        self._ready: dict[Hashable, tuple[Run, PyTreeDef]] = {}
+        self._ready: dict[Hashable, tuple[Run, PyTreeDef] | None] = {}
         update_wrapper(self, function)
 
     def __call__(self, *arguments: PyTree, **named: PyTree) -> PyTree:
         leaves, given = jax.tree.flatten(arguments)
         if not _folders or named or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
             return self.jitted(*arguments, **named)
-        kind = given, *((leaf.shape, leaf.dtype) for leaf in leaves)
+        kind = given, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         if kind not in self._ready:
-            self._ready[kind] = program(self._function, arguments, _folders[-1])
-        run, structure = self._ready[kind]
+            ours = all_ours(arguments)
+            self._ready[kind] = program(self._function, arguments, _folders[-1]) if ours else None
+        ready = self._ready[kind]
+        if ready is None:
+            return self.jitted(*arguments)
+        run, structure = ready
         return jax.tree.unflatten(structure, run(leaves))
+
+
+def all_ours(tree: PyTree) -> bool:
+    """Whether all modules in a tree are jaxnav's: nobody knows the sources of others."""
+    parts = jax.tree.leaves(
+        tree, is_leaf=lambda part: isinstance(part, eqx.Module | jaxlie.MatrixLieGroup)
+    )
+    for part in parts:
+        if isinstance(part, eqx.Module):
+            if not type(part).__module__.startswith("jaxnav."):
+                return False
+            if not all_ours(list(vars(part).values())):
+                return False
+    return True
 
 
 def program(
@@ -135,8 +160,11 @@ def _compiled(
     run = jax.jit(flat).lower(inputs).compile()
     # A loaded program does not find functions of other libraries, such as LAPACK's.
     if "custom_call_target" not in (run.as_text() or ""):
-        with suppress(NotStorableError):
-            _keep(folder, name, to_bytes(run, seen[0]))
+        # It closes over arrays, or its backend or its tree can't be stored.
+        with suppress(ValueError, NotImplementedError, pickle.PicklingError, AttributeError):
+            machine_code, _, _ = serialize(run)
+            content = pickle.dumps((machine_code, jax.tree.map(lambda leaf: 0, seen[0])))
+            _keep(folder, name, hashlib.sha256(content).digest() + content)
     return run, jax.tree.structure(seen[0])
 
 
@@ -146,7 +174,16 @@ def _loaded(
     try:
         with PrivateFolder(folder) as files:
             raw = files.read(name)
-        run, structure = from_bytes(raw, inputs)
+        content = raw[_CHECKSUM_BYTES:]
+        # Damaged machine code may do anything: it must not even be parsed.
+        if hashlib.sha256(content).digest() != raw[:_CHECKSUM_BYTES]:
+            return None
+        machine_code, tree = pickle.loads(content)  # as trusted as the code, which is run
+        given = jax.tree.structure((([0] * len(inputs),), {}))
+        leaves, structure = jax.tree.flatten(tree)
+        returned = jax.tree.structure(leaves)
+        devices = jax.devices()[:1]
+        run = deserialize_and_load(machine_code, given, returned, execution_devices=devices)
         blank = [np.zeros(like.shape, like.dtype) for like in inputs]
         jax.block_until_ready(run(blank))  # a program that does not run here fails now
     except Exception:  # none yet, none for this machine, or a foreign one: it is compiled anew

@@ -56,8 +56,7 @@ from jaxnav.recordings.records import Flag
 SETUP_VERSION = 1
 # Folders of sources on which the bits of a drive don't depend.
 _WITHOUT = (
-    "calibrate", "commands", "core/lanes", "experiments", "pictures", "recordings/other", "sim",
-    "vehicles",
+    "calibrate", "commands", "experiments", "pictures", "recordings/other", "sim", "vehicles",
 )  # fmt: skip
 # The other selectors need what only a simulation has: another sensor, the truth.
 PILOT_SELECTORS = tuple(name for name in SELECTORS if name not in ("orientation-given", "oracle"))

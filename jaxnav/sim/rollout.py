@@ -11,17 +11,16 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, UInt32
 
 from jaxnav.core.control import TwistCommand
 from jaxnav.core.filter.kalman import nis
-from jaxnav.core.lanes.over_lanes import lanes_first, lanes_last, over_lanes
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, safe_norm, wrap_angle
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator, Step
 from jaxnav.core.pose.observation import Observation
-from jaxnav.sim.batch_jit import lanes_jit
+from jaxnav.files.executables import kept
 from jaxnav.sim.corners import drifted, see
 from jaxnav.sim.drive import PASSED_M
 from jaxnav.sim.gyro import read_gyro, switched_on
@@ -33,14 +32,12 @@ from jaxnav.sim.plant import (
     odometry,
     standing,
 )
-from jaxnav.sim.queue import run_lanes
-from jaxnav.sim.regimes import step_by_regime
+from jaxnav.sim.queue import Slots, program_sizes, run_drives
 from jaxnav.sim.scenarios import Scenario
 from jaxnav.sim.traces import DriveTraces
-from jaxnav.sim.world import DriveState, Spread, nominal
+from jaxnav.sim.world import DriveState, Spread, nominal, with_bank
 
 _SUBSTEPS = 4  # for each of the two parts of a frame period
-_ACCELERATOR_LANES = 2048
 
 
 class Trace(eqx.Module):
@@ -59,31 +56,16 @@ class Trace(eqx.Module):
     done: Bool[Array, "*S"]  # in the navigator's belief
 
 
-# (world before a frame, world after it) -> record
-Keep = Callable[[DriveState, DriveState], PyTree]
+class Keep(eqx.Module):
+    """A record of every frame beside its `Trace`; this one keeps nothing."""
 
-
-def by_lanes(drives: int, many: int) -> bool:
-    """Whether so many drives run through `over_lanes`: `many` or more, on the processor."""
-    return drives >= many and jax.default_backend() == "cpu"
-
-
-def vmap_lanes(on_cpu: int) -> int:
-    """The most lanes that run under `vmap` at once: `on_cpu`, or those of an accelerator."""
-    return on_cpu if jax.default_backend() == "cpu" else max(on_cpu, _ACCELERATOR_LANES)
-
-
-def nothing(before: DriveState, after: DriveState) -> None:
-    """Keep no record of a frame."""
+    def __call__(self, before: DriveState, obs: Observation, after: DriveState) -> PyTree:
+        """The record of a frame, by the worlds before and after it and what was observed."""
+        return None
 
 
 class Rollout(eqx.Module):
-    """A simulation of drives of one navigator in one scenario, compiled once for a batch of lanes.
-
-    A lane whose drive has ended takes the next seed, so that long drives leave no lane idle. Many
-    drives run through `over_lanes`, one thread per core or device: ten times as fast as `vmap`.
-    Few drives run under `vmap`, which compiles ten times as fast; so do all on an accelerator.
-    """
+    """A simulation of drives of one navigator in one scenario, many side by side (`run_drives`)."""
 
     navigator: Navigator
     vehicle: Vehicle | TwistBase
@@ -93,12 +75,7 @@ class Rollout(eqx.Module):
     corner_drift_px: Float[Array, ""] | None = None  # None: the scenario's
     start_pose: Float[Array, " 3"] | None = None  # None: the scenario's
     spread: Spread | None = eqx.field(static=True, default=None)  # None: all cars are nominal
-    lanes: int = eqx.field(static=True, default=128)
-    all_lanes: bool = eqx.field(static=True, default=False)  # for fewer drives, too
     chunk_frames: int = eqx.field(static=True, default=15)
-    many: int = eqx.field(static=True, default=2048)  # least number of drives for `over_lanes`
-    many_lanes: int = eqx.field(static=True, default=1024)  # per thread
-    threads: int = eqx.field(static=True, default=max(1, os.cpu_count() or 1))
 
     def run(
         self, keys: Key[Array, " S"], progress: Callable[[int], object] = lambda ended: None
@@ -109,68 +86,36 @@ class Rollout(eqx.Module):
             keys: one for each drive; a key's drive does not depend on the others.
             progress: called with the number of drives that have ended since the last call.
         """
-        return self.run_keeping(keys, nothing, progress)[0]
+        return self.run_keeping(keys, Keep(), progress)[0]
 
     def run_keeping(
         self,
         keys: Key[Array, " S"],
         keep: Keep,
         progress: Callable[[int], object] = lambda ended: None,
+        like: int | None = None,
     ) -> tuple[Trace, PyTree]:
-        """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated."""
-        if by_lanes(len(keys), self.many):
-            lanes, threads, advance = self.many_lanes, self.threads, self._advance_many
-        else:
-            most = vmap_lanes(self.lanes)
-            lanes = most if self.all_lanes else min(most, len(keys))
-            threads, advance = 1, self._advance
-        kept = run_lanes(
+        """`run`, and `keep`'s record of every frame; after a drive's end its last is repeated.
+
+        Args:
+            like: with the programs for so many drives, and so with their bits; by default those of
+                `keys`.
+        """
+        traces = run_drives(
             keys,
-            self.start,
-            lambda worlds: advance(worlds, keep),
-            lanes,
-            threads,
+            lambda keys: _start(self, jax.random.key_data(keys)),
+            lambda worlds, slots: _advance(self, keep, worlds, slots),
+            program_sizes(self.navigator, like or len(keys)),
             DriveTraces(len(keys), self.chunk_frames),
+            os.cpu_count() or 1,
             progress,
         )
-        (trace, further), own = kept.stack()
+        (trace, further), own = traces.stack()
         return eqx.tree_at(lambda t: t.active, trace, trace.active & own), further
 
-    @eqx.filter_jit
-    def start(self, keys: Key[Array, " lanes"]) -> DriveState:
-        """The worlds of drives before their first frames, leading axis (lanes,)."""
-        worlds = jax.vmap(self.first)(keys)
-        # Strong types, as `_advance` returns them, or it would be compiled twice.
-        return jax.tree.map(lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), worlds)
-
-    @eqx.filter_jit
-    def _advance(self, worlds: DriveState, keep: Keep) -> tuple[DriveState, tuple[Trace, PyTree]]:
-        """Advance every lane by `chunk_frames`, under `vmap`."""
-        step = self.navigator.step
-        advanced: tuple[DriveState, tuple[Trace, PyTree]] = jax.vmap(
-            lambda world: jax.lax.scan(
-                lambda w, _: self._kept(w, step, keep), world, length=self.chunk_frames
-            )
-        )(worlds)
-        return advanced
-
-    @lanes_jit
-    def _advance_many(
-        self, worlds: DriveState, keep: Keep
-    ) -> tuple[DriveState, tuple[Trace, PyTree]]:
-        """`_advance` for many lanes by `over_lanes`, each lane in its own branches."""
-        step = step_by_regime(self.navigator)
-        frame = over_lanes(lambda world: self._kept(world, step, keep))
-        worlds, kept = jax.lax.scan(
-            lambda w, _: frame(w), lanes_last(worlds), length=self.chunk_frames
-        )
-        return lanes_first(worlds), lanes_first(kept)
-
-    def _kept(
-        self, world: DriveState, step: Step, keep: Keep
-    ) -> tuple[DriveState, tuple[Trace, PyTree]]:
-        after, trace = self.frame(world, step)
-        return after, (trace, keep(world, after))
+    def start(self, keys: Key[Array, " S"]) -> DriveState:
+        """The worlds of drives before their first frames, leading axis (S,)."""
+        return _start(self, jax.random.key_data(keys))
 
     def first(self, key: Key[Array, ""]) -> DriveState:
         """The world of a drive before its first frame."""
@@ -200,7 +145,7 @@ class Rollout(eqx.Module):
             )
         stands = standing(truth.vehicle, start.dtype)
         return DriveState(
-            key=key,
+            key=jax.random.key_data(key),
             rig=scenario.true_rig(self.navigator.rig, rig_key),
             truth=truth,
             drift=drift,
@@ -211,12 +156,31 @@ class Rollout(eqx.Module):
             gyro=gyro,
             state=self.navigator.init(),
             frame=jnp.asarray(0),
+            seen=jnp.asarray(0),
             passed=jnp.asarray(0),
             ended=jnp.asarray(False),
             on_floor=jnp.asarray(True),
         )
 
-    def frame(self, world: DriveState, step: Step) -> tuple[DriveState, Trace]:
+    def chunk(
+        self, world: DriveState, keep: Keep, slots: Slots
+    ) -> tuple[DriveState, tuple[Trace, PyTree], Bool[Array, ""]]:
+        """Advance a drive by `chunk_frames`: the record of each, and whether slots were lacking."""
+        step = slots.of(self.navigator).step
+
+        def frame(
+            carry: tuple[DriveState, Array], _: None
+        ) -> tuple[tuple[DriveState, Array], tuple[Trace, PyTree]]:
+            world, lacks = carry
+            after, trace, obs = self.frame(world, step)
+            lacks |= slots.lack(after.seen, world.bank, after.bank) & ~world.ended
+            return (strong(after), lacks), (trace, keep(world, obs, after))
+
+        start = with_bank(world, slots.cut(world.bank)), jnp.asarray(False)
+        (after, lacks), records = jax.lax.scan(frame, start, length=self.chunk_frames)
+        return with_bank(after, slots.restored(after.bank, world.bank)), records, lacks
+
+    def frame(self, world: DriveState, step: Step) -> tuple[DriveState, Trace, Observation]:
         """Move for a frame period, the last command acting after its latency; then observe."""
         scenario = self.scenario
         dtype = world.car.pose.dtype
@@ -230,7 +194,8 @@ class Rollout(eqx.Module):
         )
         turned_rad = car.pose[2] - world.car.pose[2]
         car = scenario.displaced(car, stamp_s, period_s)
-        key_corners, key_odometry = jax.random.split(jax.random.fold_in(world.key, world.frame))
+        key = jax.random.wrap_key_data(world.key)
+        key_corners, key_odometry = jax.random.split(jax.random.fold_in(key, world.frame))
 
         # Late corners lie where they were a part of a frame period earlier.
         part = world.truth.sensor_errors[-1] / scenario.frame_period_s
@@ -302,7 +267,7 @@ class Rollout(eqx.Module):
         ended = world.ended | ~on_floor | (frame >= scenario.frames)
         if scenario.drives:
             ended = ended | out.done
-        return dataclasses.replace(
+        after = dataclasses.replace(
             world,
             drift=drift,
             car=car,
@@ -311,10 +276,12 @@ class Rollout(eqx.Module):
             gyro=gyro,
             state=state,
             frame=frame,
+            seen=jnp.sum(visible),
             passed=passed,
             ended=ended,
             on_floor=on_floor,
-        ), trace
+        )
+        return after, trace, obs
 
     def _moved(self, world: DriveState, period_s: Array) -> CarState | BaseState:
         """The car one period later: a command acts `latency_s` after the frame it came from."""
@@ -323,3 +290,23 @@ class Rollout(eqx.Module):
             states = move_through(world.truth.vehicle, car, command, dt_s, _SUBSTEPS)
             car = jax.tree.map(lambda leaf: leaf[-1], states)
         return car
+
+
+def strong(world: DriveState) -> DriveState:
+    """The world with strong types, as a step returns it, or a step would be compiled twice."""
+    typed: DriveState = jax.tree.map(
+        lambda leaf: jax.lax.convert_element_type(leaf, leaf.dtype), world
+    )
+    return typed
+
+
+@kept
+def _start(rollout: Rollout, keys: UInt32[Array, "drives 2"]) -> DriveState:
+    return strong(jax.vmap(lambda key: rollout.first(jax.random.wrap_key_data(key)))(keys))
+
+
+@kept
+def _advance(
+    rollout: Rollout, keep: Keep, worlds: DriveState, slots: Slots
+) -> tuple[DriveState, tuple[Trace, PyTree], Bool[Array, " drives"]]:
+    return jax.vmap(lambda world: rollout.chunk(world, keep, slots))(worlds)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
 from jaxnav.core.control import Command, TwistCommand
+from jaxnav.core.filter.bank import Bank
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import State
@@ -89,7 +90,7 @@ class Spread:
 class DriveState(eqx.Module):
     """The quantities that one seed drew, and the state of its drive."""
 
-    key: Key[Array, ""]
+    key: UInt32[Array, " 2"]  # data of a JAX key
     rig: CameraRig  # the true one
     truth: Truth
     drift: Float[Array, "C M 4 2"]  # of the corners, in standard deviations
@@ -100,9 +101,21 @@ class DriveState(eqx.Module):
     gyro: GyroState | None
     state: State
     frame: Int[Array, ""]  # index of the next frame
+    seen: Int[Array, ""]  # number of sightings in the last one
     passed: Int[Array, ""]
     ended: Bool[Array, ""]
     on_floor: Bool[Array, ""]
+
+    @property
+    def bank(self) -> Bank:
+        """The navigator's hypotheses."""
+        return self.state.belief.bank
+
+
+def with_bank(world: DriveState, bank: Bank) -> DriveState:
+    """A world whose navigator has these hypotheses."""
+    replaced: DriveState = eqx.tree_at(lambda w: w.state.belief.bank, world, bank)
+    return replaced
 
 
 def nominal(

@@ -1,6 +1,5 @@
 """Algorithm 1 as one pure step: the same alone, scanned and vmapped; its gradient; bad input."""
 
-import dataclasses
 import functools
 from typing import ClassVar
 
@@ -15,14 +14,11 @@ from hypothesis import strategies as st
 
 from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.filter.choose import MeasuredPose, PaperCost, Selection
-from jaxnav.core.filter.hypotheses import MultiHypothesis
-from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator, Output, State
 from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
-from jaxnav.sim.regimes import step_by_regime
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
 from tests.reference import kalman, paper
@@ -426,47 +422,6 @@ class EachItsOwn(eqx.Module):
             flip_probability=jnp.asarray(0.5),
             decided=jnp.asarray(True),
         )
-
-
-by_regime = jax.jit(lambda nav, state, obs: jax.lax.scan(step_by_regime(nav), state, obs))
-
-
-def spanning(bank):
-    """The bank with one hypothesis, at the mirrored pose, too wide to know."""
-    out = step(navigator(), navigator().init(), at(drive(), 0))[1]
-    Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(out.candidates.T_vehicle_world)
-    poses = np.asarray(planar_from_T_world_vehicle(Ts_world_vehicle))
-    gaps = np.linalg.norm(poses[:2] - true_poses()[0], axis=1)
-    wrong, apart = poses[np.argmax(gaps)], poses[0] - poses[1]
-    return dataclasses.replace(
-        bank,
-        mean=bank.mean.at[0, :3].set(wrong),
-        covariance=bank.covariance.at[0, :3, :3].set(jnp.diag(apart**2 + 0.5**2)),
-        initialised=bank.initialised.at[0].set(True),
-    )
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("start", ["empty", "one that spans both poses"])
-def test_step_by_regime_is_step(start):
-    """A start with the whole bank, a few hypotheses, one; one sighting, two and none."""
-    nav = navigator(selector=MultiHypothesis(hypotheses=12), max_sightings=2)
-    obs = drive(sigma_px=1.0, blind=(STEPS - 2,))
-    begin = nav.init()
-    if start != "empty":
-        begin = eqx.tree_at(lambda s: s.belief.bank, begin, spanning(begin.belief.bank))
-    state, out = scan(nav, begin, obs)
-    _, same = by_regime(nav, begin, obs)
-    bank = state.belief.bank
-    assert int(np.sum(bank.initialised)) < 8
-    if start != "empty":
-        assert int(out.hypothesis[0]) == 0  # the mirrored one
-        assert int(out.hypothesis[-1]) > 0
-    for name in ("selected", "hypothesis", "decided", "located", "done"):
-        np.testing.assert_array_equal(getattr(same, name), getattr(out, name))
-    for name in ("pose", "covariance", "flip_probability", "nis", "command"):
-        for a, b in zip(*(jax.tree.leaves(getattr(o, name)) for o in (same, out)), strict=True):
-            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-8)
 
 
 def test_more_hypotheses_need_no_change_to_step():

@@ -1,13 +1,17 @@
 """Rollouts with a spy in place of the navigator, which tells what it was given."""
 
 import dataclasses
+from collections.abc import Callable
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from jaxnav.core.control import Command
+from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
+from jaxnav.core.navigator import Navigator
 from jaxnav.sim.plant import OdometryNoise
 from jaxnav.sim.rollout import Rollout, Trace
 from jaxnav.sim.scenarios import Scenario, scenarios
@@ -19,24 +23,25 @@ SEEDS = jnp.asarray([3, 5, 8])
 keys = jax.vmap(jax.random.key)
 
 
-class Spy:
-    """In place of a navigator: sends one command, and tells through the trace what it was given.
+class Spy(Navigator):
+    """Sends one command, and tells through the trace what it was given.
 
-    `told(obs)` becomes `flip_probability`; `located` says whether anything was in view.
+    `told(obs)` becomes `flip_probability`; `located` says whether anything was in view. The number
+    of frames so far is in `belief.restarts`.
     """
 
-    rig = RIG
+    throttle: float = eqx.field(static=True)
+    steering_rad: float = eqx.field(static=True)
+    told: Callable = eqx.field(static=True)
 
-    def __init__(self, throttle=0.0, steering_rad=0.0, told=lambda obs: obs.speed_mps):
+    def __init__(self, throttle=0.0, steering_rad=0.0, told=lambda obs: obs.speed_mps, rig=RIG):
+        super().__init__(rig, MARKERS, selector=LowestReprojection())
         self.throttle, self.steering_rad, self.told = throttle, steering_rad, told
 
-    # Of strong types all, or every program would be compiled twice.
-    def init(self):
-        return jnp.zeros((), int)
-
-    def step(self, frame, obs):
+    def step(self, state, obs):
         one = SimpleNamespace(valid=jnp.ones(1, bool), steps=jnp.ones(1, int))
-        return frame + 1, SimpleNamespace(
+        state = eqx.tree_at(lambda s: s.belief.restarts, state, state.belief.restarts + 1)
+        return state, SimpleNamespace(
             candidates=one,
             pose=planar_from_T_world_vehicle(obs.T_world_vehicle_true),
             covariance=jnp.eye(6),

@@ -14,7 +14,7 @@ from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.navigator import Navigator
 from jaxnav.sim.corners import see
 from jaxnav.sim.plant import OdometryNoise
-from jaxnav.sim.rollout import Rollout
+from jaxnav.sim.rollout import Keep, Rollout
 from jaxnav.sim.scenarios import Scenario, on_laps, scenarios
 from jaxnav.vehicles.world import SimWorld, WorldSettings
 from tests import worlds
@@ -37,7 +37,7 @@ def aside(**changes) -> Scenario:
 def test_corners_drift_as_a_gauss_markov_process_each_for_itself():
     seeds, frames = 24, 150
     rollout = Rollout(Spy(), CAR, MARKERS, aside(duration_s=frames * PERIOD_S), 1.0)
-    _, drift = rollout.run_keeping(keys(jnp.arange(seeds)), lambda before, after: after.drift)
+    _, drift = rollout.run_keeping(keys(jnp.arange(seeds)), Drift())
     assert drift.shape == (seeds, frames, 4, 1, 4, 2)
     series = drift.reshape(seeds, frames, 32)
     assert np.var(series) == pytest.approx(1, abs=0.1)
@@ -54,9 +54,9 @@ def test_corners_drift_as_a_gauss_markov_process_each_for_itself():
 
 def test_corners_lie_off_by_the_drift():
     rollout = Rollout(Spy(told=corner_x_px), CAR, MARKERS, aside(), 0.0)
-    exact, _ = rollout.run_keeping(keys(SEEDS), lambda before, after: after.drift)
+    exact, _ = rollout.run_keeping(keys(SEEDS), Drift())
     given = dataclasses.replace(rollout, corner_drift_px=jnp.asarray(0.5))
-    shown, drift = given.run_keeping(keys(SEEDS), lambda before, after: after.drift)
+    shown, drift = given.run_keeping(keys(SEEDS), Drift())
     off_px = shown.flip_probability - exact.flip_probability
     np.testing.assert_allclose(off_px, 0.5 * drift[:, :, LEFT, 0, 0, 0], atol=1e-9)
     assert np.ptp(off_px) > 0.5
@@ -151,16 +151,15 @@ def test_the_car_that_run_drives_in_simulation_has_the_same_odometer():
         assert world.state(at_ns)[3] > 0.3
 
 
-class ByHand(Spy):
-    """A rig whose cameras are somewhere near where it says."""
-
-    rig = worlds.qcar_rig_by_hand()
+class Drift(Keep):
+    def __call__(self, before, obs, after):
+        return after.drift
 
 
 def test_cameras_and_sensors_are_off_as_their_files_tell():
     """Shifted along and turned about the vehicle's axes; the true car is (1 + k) times the read."""
-    car, rig = worlds.qcar_by_hand(), ByHand.rig
-    rollout = Rollout(ByHand(), car, MARKERS, scenarios()["as-told"], 0.0)
+    car, rig = worlds.qcar_by_hand(), worlds.qcar_rig_by_hand()
+    rollout = Rollout(Spy(rig=rig), car, MARKERS, scenarios()["as-told"], 0.0)
     drawn = rollout.start(keys(jnp.arange(400)))
     errors = np.asarray(drawn.truth.sensor_errors) / np.asarray(car.sensor_sigma)
 
@@ -193,7 +192,9 @@ def test_what_the_default_claims_is_true_where_errors_are_as_told():
     scenario = dataclasses.replace(scenarios()["as-told"], duration_s=2.0)
     car = worlds.qcar_by_hand()
     motion = BicycleKalman(car, tilt_sigma_rad=0.0, height_sigma_m=0.0)
-    navigator = Navigator(ByHand.rig, MARKERS, car, scenario.waypoints_m, motion=motion)
+    navigator = Navigator(
+        worlds.qcar_rig_by_hand(), MARKERS, car, scenario.waypoints_m, motion=motion
+    )
     trace = Rollout(navigator, car, MARKERS, scenario, 1.0).run(keys(jnp.arange(32)))
     counted = np.asarray(trace.active & trace.decided)
     nees = np.where(counted, trace.nees, 0).sum(axis=1) / counted.sum(axis=1)

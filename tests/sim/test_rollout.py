@@ -1,6 +1,7 @@
 """Rollouts at corner level: their observations, and the events of each scenario."""
 
 import dataclasses
+import os
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +9,13 @@ import numpy as np
 import pytest
 
 from jaxnav.core.filter.choose import PaperCost
+from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.navigator import Navigator
+from jaxnav.sim import queue
+from jaxnav.sim import rollout as rollout_module
 from jaxnav.sim.corners import MIN_SIDE_PX, see
-from jaxnav.sim.rollout import Rollout
+from jaxnav.sim.rollout import Keep, Rollout
 from jaxnav.sim.scenarios import HEADING_SIGMA_RAD, scenarios
 from tests import worlds
 from tests.helpers.spying import CAR, MARKERS, QUIET, RIG, SEEDS, Spy, keys, run, short
@@ -66,30 +70,24 @@ def real() -> Rollout:
         RIG, MARKERS, CAR, waypoints_m=worlds.WAYPOINTS_M, selector=PaperCost(), max_candidates=2
     )
     scenario = dataclasses.replace(scenarios()["paper"], duration_s=1.2)
-    return Rollout(navigator, CAR, MARKERS, scenario, 1.0, lanes=2, chunk_frames=9)
+    return Rollout(navigator, CAR, MARKERS, scenario, 1.0, chunk_frames=9)
 
 
 def test_a_seed_s_drive_does_not_depend_on_the_others(real):
+    """Nor on their number, where the programs are those of one number."""
     ended = []
     first = real.run(keys(jnp.asarray([3, 5, 8])), ended.append)
     assert sum(ended) == 3
-    # Two lanes for four drives: the last two take over where others have ended.
-    other = real.run(keys(jnp.asarray([5, 1, 8, 3])))
+    other, _ = real.run_keeping(keys(jnp.asarray([5, 1, 8, 3])), Keep(), like=3)
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(other), strict=True):
         np.testing.assert_array_equal(a, b[[3, 0, 2]])
     assert not np.allclose(first.true_pose[0], first.true_pose[1])
     assert not np.allclose(first.pose[0] - first.true_pose[0], 0)
-
-
-def test_lanes_beyond_the_drives_count_for_nothing(real):
-    ended = []
-    alone = dataclasses.replace(real, all_lanes=True).run(keys(jnp.asarray([8])), ended.append)
-    assert sum(ended) == 1
-    both = real.run(keys(jnp.asarray([8, 3])))
+    alone, _ = real.run_keeping(keys(jnp.asarray([8])), Keep(), like=3)
     own = alone.active[0]
-    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(both), strict=True):
+    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(first), strict=True):
         assert len(a) == 1
-        np.testing.assert_array_equal(a[0][own], b[0][: len(own)][own])
+        np.testing.assert_array_equal(a[0][own], b[2][: len(own)][own])
 
 
 def test_a_seed_draws_what_it_always_drew():
@@ -114,49 +112,52 @@ def test_a_seed_draws_what_it_always_drew():
     np.testing.assert_allclose(trace.flip_probability[:, ::7], drawn, rtol=1e-7)
 
 
-def test_a_lane_takes_the_next_seed_where_its_drive_has_ended():
-    """Drives of unequal length: some leave the floor early, some stay to the end."""
+def test_a_drive_takes_the_place_of_one_that_has_ended(monkeypatch):
+    """Drives of unequal length, more of them than places, on two threads."""
     scenario = short(
         "paper", start_pose=(1.9, 0.0, 0.0), start_spread=(0.6, 0.1, 0.0), duration_s=2.0
     )
-    seeds = jnp.arange(7)
-    together = run(Spy(throttle=0.05), scenario, seeds=seeds)
-    rollout = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, 0.0, lanes=3, chunk_frames=15)
-    queued = rollout.run(keys(seeds))
+    seeds, counted = jnp.arange(45), []
+    rollout = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, 0.5, chunk_frames=5)
+    together = rollout.run(keys(seeds))
     lengths = np.sum(together.active, axis=1)
     assert lengths.min() < 10 < lengths.max() == scenario.frames
-    np.testing.assert_array_equal(np.sum(queued.active, axis=1), lengths)
-    for drive, length in enumerate(lengths):
-        np.testing.assert_allclose(
-            queued.true_pose[drive, :length], together.true_pose[drive, :length], atol=1e-12
-        )
-
-
-def test_many_drives_are_those_of_few(monkeypatch):
-    """Lanes along the last axis, in two threads, in blocks that some leave early."""
-    scenario = short(
-        "paper", start_pose=(1.9, 0.0, 0.0), start_spread=(0.6, 0.1, 0.0), duration_s=1.2
-    )
-    seeds = jnp.arange(45)
-    options = {"corner_noise_px": 0.5, "chunk_frames": 5}
-    few = Rollout(Spy(throttle=0.05), CAR, MARKERS, scenario, **options)
-    many = dataclasses.replace(few, many=40, many_lanes=16, threads=2)
-    counted = []
-    one, other = few.run(keys(seeds)), many.run(keys(seeds), counted.append)
+    monkeypatch.setattr(queue, "_POOL", 17)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    queued = rollout.run(keys(seeds[::-1]), counted.append)
     assert sum(counted) == 45
-    assert len(np.unique(np.sum(one.active, axis=1))) > 2
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
-    # Bit for bit, whatever else runs and how many threads do it.
-    again = dataclasses.replace(many, threads=1).run(keys(seeds[::-1]))
-    for a, b in zip(jax.tree.leaves(other), jax.tree.leaves(again), strict=True):
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(queued), strict=True):
         np.testing.assert_array_equal(a, b[::-1])
-    # An accelerator takes all of them under `vmap`.
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(Rollout, "_advance_many", None)
-    elsewhere = dataclasses.replace(few, many=40).run(keys(seeds))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(elsewhere), strict=True):
-        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("bank", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_programs_with_fewer_slots_compute_the_same(bank, monkeypatch):
+    """From a start with all hypotheses to one; one sighting, two and none; the marker seen again
+    after a tunnel, and a car that is carried off."""
+    scenario = dataclasses.replace(
+        scenarios()["kidnapped"], duration_s=4.0, hidden_s=(1.5, 2.0), kidnapped_s=2.5
+    )
+    selector = MultiHypothesis(hypotheses=12) if bank else PaperCost()
+    navigator = Navigator(RIG, MARKERS, CAR, worlds.WAYPOINTS_M, selector=selector)
+    rollout = Rollout(navigator, CAR, MARKERS, scenario, 1.0, chunk_frames=6)
+    used, original = set(), rollout_module._advance
+
+    def spy(rollout, keep, worlds, slots):
+        used.add(slots)
+        return original(rollout, keep, worlds, slots)
+
+    monkeypatch.setattr(rollout_module, "_advance", spy)
+    seeds = keys(jnp.arange(6))
+    few = rollout.run(seeds)
+    assert len(used) == 1
+    used.clear()
+    many, _ = rollout.run_keeping(seeds, Keep(), like=1000)
+    assert len(used) == (3 if bank else 2)
+    for name in ("located", "decided", "active", "done", "passed", "on_floor"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(many, name))
+    for name in ("true_pose", "pose", "nees", "flip_probability"):
+        ours, theirs = getattr(many, name), getattr(few, name)
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7)
 
 
 def test_the_navigator_s_errors_are_measured(real):

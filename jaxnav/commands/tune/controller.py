@@ -189,7 +189,7 @@ class Gains:
 
     def _held_out(self, x: Array) -> float:
         keys = _keys(_HELD_OUT_SEED, self._args.held_out_seeds)
-        return float(np.mean(self._loop.hard_losses(x, self._space, keys, self._args.seeds)))
+        return float(np.mean(self._loop.hard_losses(x, self._space, keys)))
 
     def _test(
         self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]

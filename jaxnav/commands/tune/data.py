@@ -72,7 +72,7 @@ def _simulated(args: Arguments) -> TuningData:
     # The drives are the same whichever estimator is tuned.
     driver = car.navigator(scenario, MultiHypothesis())
     noise_px = jnp.asarray(args.corner_noise_px)
-    rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px, lanes=AT_A_TIME)
+    rollout = Rollout(driver, car.vehicle, car.markers, scenario, noise_px)
 
     def drive(first: int, count: int, progress: Progress) -> FrameSequences:
         keys = jax.vmap(jax.random.key)(first + jnp.arange(count))

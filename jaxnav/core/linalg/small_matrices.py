@@ -253,9 +253,13 @@ def where(condition: Bool[Array, "*rows"], yes: _Tree, no: _Tree) -> _Tree:
     return chosen
 
 
-def as_class(cls: type[_Module], module: object) -> _Module:
-    """An instance of a class, which may override methods, with the fields of another module."""
+def as_class(cls: type[_Module], module: object, **changes: object) -> _Module:
+    """An instance of a class, which may override methods, with the fields of another module.
+
+    Args:
+        changes: fields that get another value, also static ones.
+    """
     other = object.__new__(cls)
-    for name, part in vars(module).items():
+    for name, part in (vars(module) | changes).items():
         object.__setattr__(other, name, part)
     return other

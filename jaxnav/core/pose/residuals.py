@@ -175,12 +175,13 @@ def reprojection_rows(rig: CameraRig, seen: Sightings) -> Callable[[Float[Array,
 
 
 def pinhole_rows(
-    corners_n: Float[Array, "P 2"], unit: Float[Array, ""]
+    corners_n: Float[Array, "P 2 *N"], unit: Float[Array, "*N"]
 ) -> Callable[[Float[Array, "3 P N"]], Rows]:
     """As `reprojection_rows` for a camera of focal length 1, in multiples of `unit`.
 
     Args:
-        corners_n: (P, 2) observed corners, normalised image coordinates.
+        corners_n: (P, 2) observed corners, normalised image coordinates; of each problem its own
+            with an axis (N,) at the end.
         unit: in which residuals are counted.
 
     Returns:
@@ -189,7 +190,8 @@ def pinhole_rows(
 
     def rows(points: Array) -> Rows:
         image, slope = image_of("none", points, jnp.zeros(MOST_COEFFICIENTS, points.dtype))
-        return (image - corners_n.T[..., None]) / unit, slope / unit
+        seen = jnp.swapaxes(corners_n.reshape(*corners_n.shape[:2], -1), 0, 1)
+        return (image - seen) / unit, slope / unit
 
     return rows
 

@@ -4,7 +4,6 @@ A trial is one drive of `Rollout`: the navigator's own step, plant, odometer and
 """
 
 import dataclasses
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -33,14 +32,12 @@ from jaxnav.experiments.studies.study import (
     nobody,
 )
 from jaxnav.sim.bases import BASES, IMUS, equipped
-from jaxnav.sim.rollout import Rollout, Trace
+from jaxnav.sim.rollout import Keep, Rollout, Trace
 from jaxnav.sim.scenarios import Scenario, on_laps, scenarios
 from jaxnav.sim.scores import Drives
 
 OUTCOMES = ("arrived", "failed", "left the floor", "invalid")
 ARRIVED, FAILED, LEFT_FLOOR, INVALID = range(4)
-LANES = 128
-_MANY_TRIALS = 8192
 
 
 def _error(description: str, unit: str, high: float, low: float = 0.0) -> Parameter:
@@ -144,16 +141,6 @@ class DriveStudy(Study):
         world = (rig, markers, vehicle)
         self.rig, self.markers, self.vehicle = in_precision(world, config.precision)
 
-    @property
-    def box_trials(self) -> int:
-        """Trials in a box: few, to show progress; enough to fill all lanes on the fast path."""
-        return _MANY_TRIALS if self._many else self.schema.box_trials
-
-    @property
-    def _many(self) -> bool:
-        """Whether the study takes the fast path: by its trials and not by those of a box."""
-        return self.config.trials >= Rollout.many
-
     def run(
         self, cells: Sequence[Cell], trials: range, progress: Progress = nobody
     ) -> dict[str, Shaped[np.ndarray, "cells ... trials"]]:
@@ -167,7 +154,9 @@ class DriveStudy(Study):
         rollout = self.rollout(cell, scenario)
         key = jax.random.key(self.config.seed)
         keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.asarray(trials))
-        return _scores(rollout.run(keys, progress), scenario)
+        # The same bits for any number of drives in a box.
+        trace, _ = rollout.run_keeping(keys, Keep(), progress, like=self.config.trials)
+        return _scores(trace, scenario)
 
     @staticmethod
     def scenario(cell: Cell) -> Scenario:
@@ -237,10 +226,6 @@ class DriveStudy(Study):
             value["corner_noise_px"],
             jnp.asarray(_given(value["corner_drift_px"], scenario.corner_drift_px), float),
             jnp.asarray(start, float),
-            # The same shapes, and so the same bits, for any number of drives in a box.
-            lanes=min(LANES, self.config.trials),
-            all_lanes=True,
-            many=1 if self._many else sys.maxsize,
         )
 
     def _world(self, value: Mapping[str, Any]) -> tuple[CameraRig, MarkerMap]:

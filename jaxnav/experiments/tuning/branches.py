@@ -27,7 +27,6 @@ from jaxnav.core.models.vehicle import TwistBase, advance_bicycle, advance_twist
 from jaxnav.core.navigator import Navigator, State
 from jaxnav.core.pose.observation import Observation
 from jaxnav.experiments.tuning.recorded import FrameSequences
-from jaxnav.sim.batch_jit import batch_jit
 
 # Standard deviation of a pose that was carried back, m and rad: a third of the difference between
 # the two poses of a marker where they can be mistaken for each other.
@@ -44,7 +43,7 @@ class SequenceEstimates(eqx.Module):
     decided: Bool[Array, "*B T"]
 
 
-@batch_jit
+@eqx.filter_jit
 def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
     """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
 

@@ -9,7 +9,9 @@ from jaxtyping import Array, Float
 
 from jaxnav.core.models.geometry import safe_norm, safe_sqrt
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
+from jaxnav.core.pose.observation import Observation
 from jaxnav.experiments.tuning.soft_switch import SoftState
+from jaxnav.sim.rollout import Keep
 from jaxnav.sim.scenarios import Scenario
 from jaxnav.sim.world import DriveState
 
@@ -64,17 +66,15 @@ def no_costs(dtype: jnp.dtype) -> Costs:
     return Costs(*(jnp.zeros((), dtype),) * 5)
 
 
-@dataclass(frozen=True)
-class CostsOfFrame:
-    """A function that returns the costs of one frame, zero once the drive has ended.
+class CostsOfFrame(Keep):
+    """A record of the costs of each frame, zero once the drive has ended.
 
-    It takes a soft or a hard controller. Instances compare by value, so that
-    `Rollout.run_keeping` compiles once for them.
+    It takes a soft or a hard controller.
     """
 
-    scenario: Scenario
+    scenario: Scenario = eqx.field(static=True)
 
-    def __call__(self, before: DriveState, after: DriveState) -> Costs:
+    def __call__(self, before: DriveState, obs: Observation, after: DriveState) -> Costs:
         scenario, dtype = self.scenario, after.car.pose.dtype
         period_s = jnp.asarray(scenario.frame_period_s, dtype)
         waypoints_m = jnp.asarray(scenario.waypoints_m, dtype).reshape(-1, 2)

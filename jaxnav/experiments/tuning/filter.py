@@ -16,7 +16,6 @@ from jaxnav.experiments.tuning.following import follow, trust_corners
 from jaxnav.experiments.tuning.objective import Batch
 from jaxnav.experiments.tuning.recorded import FrameSequences
 from jaxnav.experiments.tuning.unconstrained import Space
-from jaxnav.sim.batch_jit import batch_jit
 
 _CM2_PER_M2 = 1e4
 
@@ -80,7 +79,7 @@ class FilterCost(eqx.Module):
         return _mean(self, x, batch)
 
 
-@batch_jit
+@eqx.filter_jit
 def _mean(cost: FilterCost, x: Array, batch: Batch) -> Array:
     zero = jnp.zeros((), x.dtype)
     costs = jax.vmap(lambda item: cost(x, item, zero))(batch.items)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,12 +11,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.navigator import Output, State
 from jaxnav.core.pose.observation import Observation
-from jaxnav.sim.batch_jit import batch_jit
-from jaxnav.sim.queue import run_lanes
-from jaxnav.sim.rollout import Rollout
-from jaxnav.sim.traces import DriveTraces
+from jaxnav.sim.rollout import Keep, Rollout
 from jaxnav.sim.world import DriveState
 
 
@@ -73,17 +68,8 @@ def simulate_sequences(
         keys: one for each drive; a key's drive does not depend on the others.
         progress: called with the number of drives that have ended since the last call.
     """
-    kept = run_lanes(
-        keys,
-        rollout.start,
-        lambda worlds: _advance(rollout, worlds),
-        min(rollout.lanes, len(keys)),
-        1,
-        DriveTraces(len(keys), rollout.chunk_frames),
-        progress,
-    )
-    (obs, true_poses, decided, active), own = kept.stack()
-    active &= own
+    trace, obs = rollout.run_keeping(keys, _Observations(), progress)
+    true_poses, decided, active = map(np.asarray, (trace.true_pose, trace.decided, trace.active))
     count, length = len(active), int(active.sum(axis=1).max())
     judged = np.maximum.accumulate(decided & active, axis=1) & active
     poses = T_world_vehicle_from_planar(jnp.asarray(true_poses[:, :length]))
@@ -99,22 +85,8 @@ def simulate_sequences(
     )
 
 
-@batch_jit
-def _advance(rollout: Rollout, worlds: DriveState) -> tuple[DriveState, tuple[Any, ...]]:
-    """Advance every lane by `chunk_frames`, and keep its frames: the observations, true poses, and
-    masks of decided and of active ones; (lanes, frames, ...)."""
+class _Observations(Keep):
+    """A record of every observation, without the truth."""
 
-    def frame(world: DriveState, _: None) -> tuple[DriveState, tuple[Any, ...]]:
-        seen: list[Observation] = []
-
-        def step(state: State, obs: Observation) -> tuple[State, Output]:
-            seen.append(dataclasses.replace(obs, T_world_vehicle_true=None, heading_rad=None))
-            return rollout.navigator.step(state, obs)
-
-        world, trace = rollout.frame(world, step)
-        return world, (seen[0], trace.true_pose, trace.decided, trace.active)
-
-    advanced: tuple[DriveState, tuple[Any, ...]] = jax.vmap(
-        lambda world: jax.lax.scan(frame, world, length=rollout.chunk_frames)
-    )(worlds)
-    return advanced
+    def __call__(self, before: DriveState, obs: Observation, after: DriveState) -> Observation:
+        return dataclasses.replace(obs, T_world_vehicle_true=None, heading_rad=None)

@@ -34,7 +34,7 @@ class Space(eqx.Module):
     """The unconstrained space of some parameters of a navigator."""
 
     free: dict[str, Float[Array, "*shape"]]  # name -> where tuning starts
-    full: frozenset[str] = eqx.field(static=True)  # those that are whole matrices
+    full: tuple[str, ...] = eqx.field(static=True)  # those that are whole matrices
 
     @staticmethod
     def from_navigator(
@@ -58,7 +58,7 @@ class Space(eqx.Module):
                 raise ValueError(f"{name}: is no covariance, and can't be a full one")
             if trainable.get(name, False):
                 free[name] = _free(TUNABLES[name], known[name], name in full)
-        return Space(free, full)
+        return Space(free, tuple(sorted(full)))
 
     @property
     def start(self) -> Float[Array, " n"]:

@@ -58,13 +58,11 @@ SPACE = Space.from_navigator(
 
 
 class Drives(Spy):
-    """In place of a navigator: the same command in every frame, decided in one frame."""
+    """The same command in every frame, decided in one frame."""
 
-    rig, markers = RIG, MARKERS
-
-    def step(self, frame, obs):
-        after, out = super().step(frame, obs)
-        out.located, out.decided = jnp.asarray(True), frame == DECIDES
+    def step(self, state, obs):
+        after, out = super().step(state, obs)
+        out.located, out.decided = jnp.asarray(True), state.belief.restarts == DECIDES
         return after, out
 
 

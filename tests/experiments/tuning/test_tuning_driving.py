@@ -16,6 +16,7 @@ from jaxnav.core.models.imu import Gyro
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator, State
 from jaxnav.core.parameters import with_parameters
+from jaxnav.experiments.tuning import driving
 from jaxnav.experiments.tuning.drive_loss import Costs, CostsOfFrame, DriveLoss
 from jaxnav.experiments.tuning.driving import ClosedLoop, without_gradient
 from jaxnav.experiments.tuning.soft_switch import SoftController, SoftState, soften_switch
@@ -233,29 +234,18 @@ def test_through_the_whole_navigator():
     assert np.all(np.isfinite(closed.value_and_grad(space.start, space, seeds)[1]))
 
 
-def test_many_drives_are_those_of_few(tame, monkeypatch):
-    """Lanes along the last axis, in two threads; more drives than lanes."""
+def test_the_hard_losses_are_those_of_the_hard_controller(tame):
+    """By the program that differentiates; a drive does not depend on their number."""
     short = dataclasses.replace(tame.rollout, scenario=scenario(duration_s=1.0), chunk_frames=5)
-    few = dataclasses.replace(tame, rollout=short)
-    rollout = dataclasses.replace(short, threads=2)
-    many = dataclasses.replace(few, rollout=rollout, many=10, many_lanes=8)
-    space, seeds = space_of(few), keys(jnp.arange(20))
-    one, other = (closed.value_and_grad(space.start, space, seeds) for closed in (few, many))
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
-    # The hard losses of fewer drives, by the program that differentiates so many.
-    hard, _, _ = few.value(space.values(space.start), seeds[:5])
-    programs = ClosedLoop._advance_many.compiled()._cached._cache_size()
-    by_the_same = many.hard_losses(space.start, space, seeds[:5], beside=20)
-    assert ClosedLoop._advance_many.compiled()._cached._cache_size() == programs
+    closed = dataclasses.replace(tame, rollout=short)
+    space, seeds = space_of(closed), keys(jnp.arange(20))
+    hard, _, _ = closed.value(space.values(space.start), seeds)
+    programs = driving._advance.jitted._cache_size()
+    by_the_same = closed.hard_losses(space.start, space, seeds)
+    assert driving._advance.jitted._cache_size() == programs + 1
     np.testing.assert_allclose(by_the_same, hard, rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(few.hard_losses(space.start, space, seeds[:5], beside=20), hard)
-    # An accelerator takes all of them under `vmap`.
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(ClosedLoop, "_advance_many", None)
-    elsewhere = dataclasses.replace(few, many=10).value_and_grad(space.start, space, seeds)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(elsewhere), strict=True):
-        np.testing.assert_array_equal(a, b)
+    closed.value_and_grad(space.start, space, seeds)
+    assert driving._advance.jitted._cache_size() == programs + 1
 
 
 def test_a_drive_without_arrival_pays_for_all_its_time():
@@ -300,7 +290,7 @@ def frame_costs(
         state=SimpleNamespace(control=state),
         **common | {"ended": jnp.asarray(False)} | others,
     )
-    return CostsOfFrame(route)(before, after)
+    return CostsOfFrame(route)(before, None, after)
 
 
 def heading_for(index) -> ControlState:
