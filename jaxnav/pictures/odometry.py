@@ -89,7 +89,10 @@ def learnt_over_time(outcomes: Outcomes, rig: CameraRig, vehicle: Vehicle) -> Fi
     """
     known = np.flatnonzero(np.isfinite(outcomes.errors).all(axis=1) & outcomes.located)
     shown = known[np.unique(np.linspace(0, len(known) - 1, _POINTS).astype(int))]
-    states = [Learnt.of(outcomes.errors[i], outcomes.errors_sigma[i], rig, vehicle) for i in shown]
+    states = [
+        Learnt.from_errors(outcomes.errors[i], outcomes.errors_sigma[i], rig, vehicle)
+        for i in shown
+    ]
     learnt = [state for state in states if state is not None]
     times_s = outcomes.times_s[shown]
     columns = max(len(rig), len(SENSOR_ERRORS))

@@ -112,7 +112,7 @@ def _read_tags(board: Board, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray
         if len(seen) < _FEW_TAGS * board.tag_count:
             scaled, back = at_scale(levels, scale)
             quads, ids, _ = decoder.detectMarkers(scaled)
-            read = [] if ids is None else np.ravel(ids).tolist()
+            read = [] if ids is None else [int(found) for found in np.ravel(ids)]
             twice |= {marker_id for marker_id in read if read.count(marker_id) > 1}
             for marker_id, quad in zip(read, quads, strict=True):
                 seen.setdefault(marker_id, back(quad.reshape(4, 2).astype(float)))

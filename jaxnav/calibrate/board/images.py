@@ -83,7 +83,7 @@ def collect_views(
     for file, name in bar(zip(files, _names(files), strict=True), total=len(files)):
         video = file.suffix.lower() in VIDEOS
         last_view: BoardView | None = None  # of this video
-        last_thumbnail = np.zeros(0)
+        last_thumbnail: np.ndarray = np.zeros(0)
         try:
             images = _frames(file) if video else [(0, read_image(file, cv2.IMREAD_GRAYSCALE))]
         except BadInput as error:

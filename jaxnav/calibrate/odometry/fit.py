@@ -118,7 +118,7 @@ class System(NamedTuple):
         def of_nodes(values: np.ndarray) -> np.ndarray:
             return np.bincount(nodes, values.ravel(), n)
 
-        band = np.bincount(at.ravel(), H[:, row, column].ravel(), _LOCAL * n)
+        band: np.ndarray = np.bincount(at.ravel(), H[:, row, column].ravel(), _LOCAL * n)
         band = band.astype(float).reshape(_LOCAL, n)
         band[0] += _HOLDS
         band[0, NEXT - NODE :] += 1.0  # the last node has no reading

@@ -230,7 +230,7 @@ def _larger(rig: CameraRig, markers: MarkerMap, factor: float) -> tuple[CameraRi
 
 
 def _longer(rig: CameraRig, markers: MarkerMap, factor: float) -> tuple[CameraRig, MarkerMap]:
-    return rig.with_focal_px(np.mean(rig.cameras.focal_px) * factor), markers
+    return rig.with_focal_px(float(np.mean(rig.cameras.focal_px)) * factor), markers
 
 
 @dataclass(frozen=True)

@@ -348,7 +348,7 @@ def solve_markers(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) 
     more = blocks * _BLOCK - corners_n.shape[0]
     corners = jnp.pad(corners_n, ((0, more), (0, 0), (0, 0))).reshape(blocks, _BLOCK, 4, 2)
     sizes = jnp.pad(size_m, (0, more), constant_values=1).reshape(blocks, _BLOCK)
-    pairs = jax.lax.map(lambda block: _solve_pairs(*block, _STEPS), (corners, sizes))
+    pairs = jax.lax.map(lambda block: _solve_pairs(block[0], block[1], _STEPS), (corners, sizes))
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: corners_n.shape[0]], pairs)
 
 

@@ -255,7 +255,7 @@ def _open_group(path: Path, mode: Any) -> zarr.Group:
 
 def _mapping(path: Path, group: zarr.Group, key: str) -> dict[str, Any]:
     try:
-        value = json.loads(dict(group.attrs)[key])
+        value = json.loads(str(dict(group.attrs)[key]))
     except (KeyError, TypeError, ValueError, RecursionError):
         raise BadInput(path, "is not a store of jaxnav study") from None
     if not isinstance(value, dict):

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -123,7 +124,10 @@ def _focal(by: float) -> Callable[[CameraRig], CameraRig]:
 
 def _swapped(*order: int) -> Callable[[CameraRig], CameraRig]:
     """Each camera in the place of another one."""
-    poses = lambda rig: rig.Ts_camera_vehicle.wxyz_xyz  # noqa: E731
+
+    def poses(rig: CameraRig) -> jax.Array:
+        return rig.Ts_camera_vehicle.wxyz_xyz
+
     return lambda rig: eqx.tree_at(poses, rig, poses(rig)[np.array(order)])
 
 
