@@ -8,9 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxnav
-from jaxnav.commands.report import save_figure
+from jaxnav.commands.report import write_report
 from jaxnav.errors import visible
-from jaxnav.files import write_json
 from jaxnav.files.provenance import Calibrated, calibrated_now
 
 
@@ -30,8 +29,6 @@ def publish(
     Raises:
         BadInput: a file can't be written.
     """
-    write_json(folder / "report.json", report)
-    save_figure(figure, folder / "report.png")
-    for line in lines:
-        print(visible(line))
-    print(f"{', '.join([*files, 'report.json', 'report.png'])} in {visible(folder)}")
+    where = f"{', '.join([*files, 'report.json', 'report.png'])} in {folder}"
+    shown = [visible(line) for line in (*lines, where)]
+    write_report(folder, report, shown, name="report.json", report=figure)

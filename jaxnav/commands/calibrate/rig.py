@@ -11,9 +11,7 @@ from jaxnav.calibrate.rig.vehicle_frame import driven_frame, moved_to_driven, mo
 from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments import CalibrateMarkers, CalibrateRig
 from jaxnav.commands.calibrate.data import RigData, read_rig_data
-from jaxnav.commands.calibrate.report import (
-    publish,
-)
+from jaxnav.commands.calibrate.report import publish
 from jaxnav.commands.calibrate.rig_results import RigResults, lines
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.report import corners_in_world
