@@ -164,6 +164,13 @@ def test_a_camera_that_looks_8_degrees_up_lifts_the_car(images):
     assert tilt_deg == pytest.approx(8, abs=0.5)
 
 
+def test_a_camera_that_looks_5_degrees_aside(images):
+    aside = rig_with("left", jaxlie.SO3.from_y_radians(np.deg2rad(5.0)))
+    problem = the_problem(examine(images, rig=aside), "error")
+    assert "marker 2 is moved by " in problem.what  # it alone is seen by that camera
+    assert problem.what.split("or camera left is turned by ")[1].startswith("5.")
+
+
 def test_a_file_that_is_wrong_in_several_ways_is_explained_by_none(images):
     shifted = moved(LOW, jaxlie.SE3.from_translation(jnp.array([0.08, 0.03, 0.0])))
     twice = eqx.tree_at(lambda m: m.size_m, shifted, shifted.size_m * jnp.array([1, 1.3, 0.8]))
