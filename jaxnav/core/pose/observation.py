@@ -189,11 +189,6 @@ class Snapshot(eqx.Module):
         seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma_px, count)
         return Snapshot(rig, markers, obs, seen)
 
-    def largest(self, count: int) -> "Snapshot":
-        """The snapshot with its first `count` sightings, which are the largest."""
-        seen = jax.tree.map(lambda leaf: leaf[:count], self.seen)
-        return dataclasses.replace(self, seen=seen)
-
 
 def log_sigmas(seen: Sightings) -> Float[Array, ""]:
     """Sum of log(sigma) over all visible coordinates, for the likelihood of the corners."""

@@ -89,14 +89,6 @@ class Candidates(eqx.Module):
         """The cost of the best candidate; inf without one."""
         return jnp.min(jnp.where(self.valid, self.cost, jnp.inf))
 
-    def padded(self, count: int) -> "Candidates":
-        """The candidates with lanes appended up to `count`, which are not valid."""
-        kept = self.valid.shape[0]
-        more = jax.tree.map(
-            lambda leaf: jnp.concatenate([leaf, jnp.repeat(leaf[:1], count - kept, axis=0)]), self
-        )
-        return eqx.tree_at(lambda c: c.valid, more, more.valid & (jnp.arange(count) < kept))
-
 
 def refine_pose(
     rig: CameraRig,
