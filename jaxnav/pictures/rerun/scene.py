@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.spatial.transform import Rotation
 
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import ZERO, inverses_in_world, opposite, planar_in_world
@@ -176,10 +175,9 @@ class RerunScene:
 
     def _show_candidates(self, Ts_vehicle_map: np.ndarray, selected: int) -> None:
         Ts = [poses.inverse(T) for T in Ts_vehicle_map if np.isfinite(T).all()]
-        ahead = [Rotation.from_quat(T[:4], scalar_first=True).apply([_ARROW_M, 0, 0]) for T in Ts]
         arrows = self._rerun.Arrows3D(
             origins=[T[4:] for T in Ts],
-            vectors=ahead,
+            vectors=[_ARROW_M * _x_axis(T[:4]) for T in Ts],
             colors=[_rgb(BLUE if index == selected else ORANGE) for index in range(len(Ts))],
             radii=0.006,
         )
@@ -272,3 +270,9 @@ def _closed(corners: np.ndarray) -> list[np.ndarray]:
 def _on_floor(places: np.ndarray) -> np.ndarray:
     """Points (N, 2) with a third coordinate of 0."""
     return np.column_stack([places, np.zeros(len(places))])
+
+
+def _x_axis(wxyz: np.ndarray) -> np.ndarray:
+    """The x axis of a rotated frame."""
+    w, x, y, z = wxyz
+    return np.array([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)])
