@@ -84,12 +84,12 @@ def advice(fit: LensFit) -> tuple[str, ...]:
     views, tilted = int(kept.sum()), "tilt the board by 30 to 45 deg"
     lines = (
         (views < 15, f"take more views: {views}, 20 to 40 are good"),
-        (focal > 0.1, f"{tilted}, fill the image: focal length to {focal:.2g} %, 0.1 is good"),
-        (center_px > 0.3, f"{tilted} to all four sides: centre to {center_px:.2g} px, 0.3 is good"),
+        (focal > 0.1, f"{tilted}, fill the image: focal length to {focal:.2g} %, 0.1 % is good"),
+        (center_px > 0.3, f"{tilted} to all sides: centre to {center_px:.2g} px, 0.3 px is good"),
         (tilt_deg < 15, f"{tilted}: less than {tilt_deg:.0f} deg in half of the views"),
         (ratio < 1.5, f"vary the distance: farthest over nearest is {ratio:.2g}, 2 is good"),
         (hidden, f"hold the board where no corner was seen: {', '.join(empty)} of the image"),
-        (unsure, f"take more views at the border: the lens to {rim_px:.2g} px there, 0.5 is good"),
+        (unsure, f"take more views at the border: known to {rim_px:.2g} px, 0.5 px is good"),
     )
     sure = f"nothing is missing: focal length to {focal:.2g} %, centre to {center_px:.2g} px"
     return tuple(line for missing, line in lines if missing) or (sure,)

@@ -23,7 +23,6 @@ from jaxnav.calibrate.rig.views import (
     turn_rad,
     wxyz_xyz,
 )
-from jaxnav.core.linalg.schur import Blocks, reduce
 from jaxnav.errors import BadInput
 
 FRAMES, NOISE_PX = 120, 0.3
@@ -206,42 +205,6 @@ def test_lenses_that_are_off_are_found_where_they_may_move(world):
     assert np.all(np.abs(error[:, :8]) < 4.5 * sigma[:, :8])
     assert np.all(sigma[:, :4] < 1.0)
     assert not error[:, 8].any()
-
-
-def test_eliminating_blocks_solves_the_whole_system():
-    rng = np.random.default_rng(0)
-    F, n, R = 5, 6, 7
-    J = rng.normal(size=(200, F * n + R))
-    # No residual is about two frames.
-    of = rng.integers(F, size=200)
-    for f in range(F):
-        J[of != f, n * f : n * f + n] = 0
-    r = rng.normal(size=200)
-    whole, gradient = J.T @ J, J.T @ r
-    free = np.ones(R, bool)
-    free[2] = False
-    frames = [slice(n * f, n * f + n) for f in range(F)]
-    blocks = Blocks(
-        own=jnp.asarray(np.stack([whole[s, s] for s in frames])),
-        cross=jnp.asarray(np.stack([whole[s, F * n :] for s in frames])),
-        shared=jnp.asarray(whole[F * n :, F * n :]),
-        own_gradient=jnp.asarray(gradient[: F * n].reshape(F, n)),
-        shared_gradient=jnp.asarray(gradient[F * n :]),
-    )
-    reduced = reduce(blocks, jnp.asarray(free), jnp.zeros(()))
-    shared = -np.linalg.solve(reduced.system, reduced.gradient)
-    kept = np.concatenate([np.ones(F * n, bool), free])
-    expected = np.zeros(F * n + R)
-    expected[kept] = -np.linalg.solve(whole[np.ix_(kept, kept)], gradient[kept])
-    np.testing.assert_allclose(shared, expected[F * n :], atol=1e-9)
-    np.testing.assert_allclose(
-        np.asarray(reduced.back_substitute(jnp.asarray(shared))).ravel(),
-        expected[: F * n],
-        atol=1e-9,
-    )
-    inverse = np.linalg.inv(whole[np.ix_(kept, kept)])[F * n :, F * n :]
-    got = np.linalg.inv(reduced.system)[np.ix_(free, free)]
-    np.testing.assert_allclose(got, inverse, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
