@@ -1,6 +1,7 @@
 """The faults, rejections and health states of a drive, named for records, screens and tests."""
 
 import enum
+from typing import Any
 
 
 class Fault(enum.IntFlag):
@@ -76,3 +77,9 @@ class Health(enum.IntEnum):
 def names(flags: enum.IntFlag) -> list[str]:
     """The names of the flags that are set."""
     return [flag.name or "" for flag in type(flags) if flag in flags]
+
+
+def counts(kind: type[enum.IntFlag], values: Any) -> dict[str, int]:
+    """How many of an array of flags have each one, of those that any has."""
+    found = {str(flag.name): int(((values & flag.value) > 0).sum()) for flag in kind}
+    return {name: count for name, count in found.items() if count}

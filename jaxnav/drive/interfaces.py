@@ -11,7 +11,7 @@ which differs in the numbers that it reads and is told. Either may have a gyro, 
 
 `jaxnav.vehicles.conformance.check_vehicle` and `check_cameras` test whether a plug-in keeps these
 promises. A vehicle may also be `Ending` or `HasTime`, and its factory may be `HasOwnFiles` or
-`SharesProcess`.
+`SharesProcess`; that of cameras may be `NeedsNoVehicle`.
 
 `jaxnav run` opens a vehicle in the process of its guard, which survives any end of the computing
 process (see `guard_process`). There `setup.vehicle` is plain numbers, `setup.rig` and
@@ -280,6 +280,15 @@ class SharesProcess(Protocol):
     """Optional part of a vehicle's factory: its cameras, for example, need the vehicle itself."""
 
     shares_process: bool  # True: the vehicle is opened in the computing process
+
+
+@runtime_checkable
+class NeedsNoVehicle(Protocol):
+    """Optional part of the cameras' factory, which may then be called with None for the vehicle:
+    `jaxnav run` opens and closes its cameras once before it compiles, so that one that can't be
+    opened is said at once."""
+
+    needs_no_vehicle: bool
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from jaxnav.drive.interfaces import Camera, Setup, Vehicle
+from jaxnav.drive.interfaces import Camera, NeedsNoVehicle, Setup, Vehicle
 from jaxnav.errors import BadInput
 
 VEHICLES = "jaxnav.vehicles"
@@ -53,7 +53,7 @@ def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehi
     return vehicle
 
 
-def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...]:
+def open_cameras(name: str, setup: Setup, vehicle: Vehicle | None) -> tuple[Camera, ...]:
     """Open the cameras of the rig, in its order.
 
     Args:
@@ -73,6 +73,17 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle) -> tuple[Camera, ...
         _close(cameras)
         raise BadInput(flag, f"{name} {problem}")
     return cameras
+
+
+def try_cameras(name: str, setup: Setup) -> None:
+    """Open cameras that need no vehicle, and close them again.
+
+    Raises:
+        BadInput: as `open_cameras`.
+    """
+    factory = load_factory("--cameras", CAMERAS, name)
+    if isinstance(factory, NeedsNoVehicle) and factory.needs_no_vehicle:
+        _close(open_cameras(name, setup, None))
 
 
 def load_factory(flag: str, group: str, name: str) -> Callable[..., Any]:

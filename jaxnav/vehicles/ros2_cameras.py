@@ -117,3 +117,6 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
             )
     connection.run()
     return list(cameras)
+
+
+setattr(open_cameras, "needs_no_vehicle", True)  # noqa: B010  (a function has no such field)

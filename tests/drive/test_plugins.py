@@ -11,7 +11,14 @@ import pytest
 
 from jaxnav.drive import plugins
 from jaxnav.drive.interfaces import Camera, Vehicle
-from jaxnav.drive.plugins import CAMERAS, VEHICLES, load_factory, open_cameras, open_vehicle
+from jaxnav.drive.plugins import (
+    CAMERAS,
+    VEHICLES,
+    load_factory,
+    open_cameras,
+    open_vehicle,
+    try_cameras,
+)
 from jaxnav.errors import BadInput
 from tests.helpers.setups import GoodCamera, GoodVehicle, good_cameras, setup_with
 
@@ -177,6 +184,18 @@ def test_cameras_that_are_not_the_rigs_are_refused_and_closed(module, change, pr
     assert str(raised.value).startswith("--cameras: somebodys:opens gives")
     kept = given if isinstance(given, list) else []
     assert all(camera.closed.is_set() for camera in kept if isinstance(camera, GoodCamera))
+
+
+def test_cameras_that_need_no_vehicle_are_tried_and_closed(module):
+    cameras = good_cameras(SETUP, None)
+    told = []
+    module.opens = lambda setup, vehicle: told.append(vehicle) or cameras
+    try_cameras("somebodys:opens", SETUP)
+    assert told == []
+    module.opens.needs_no_vehicle = True
+    try_cameras("somebodys:opens", SETUP)
+    assert told == [None]
+    assert all(camera.closed.is_set() for camera in cameras)
 
 
 def test_an_error_while_closing_does_not_hide_the_reason(module):

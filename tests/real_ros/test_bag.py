@@ -56,7 +56,7 @@ def test_a_bag_gives_the_states_of_a_replay(tmp_path, kind):
         with node(tmp_path, str(file), *words) as program:
             assert program.ends(240.0) == 0, program.said
             assert "ended: the bag is over" in program.said
-        heard = listener.heard["/jaxnav/core/pose"]
+        heard = listener.heard["/jaxnav/pose"]
         assert heard
         assert {one.child_frame_id for m in listener.heard["/tf"] for one in m.transforms} == {
             "base_link"

@@ -43,7 +43,7 @@ def test_frames_played_in_real_time_give_the_poses_of_a_replay(tmp_path, data_di
         stamp_ns = stamp.sec * 10**9 + stamp.nanosec
         poses[stamp_ns] = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
 
-    player.listen("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/core/pose", take)
+    player.listen("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/pose", take)
     player.run()
     out = tmp_path / "out"
     words = ("--limit", str(FRAMES), "--corner-sigma-px", str(SIGMA_PX), "--headless")

@@ -212,7 +212,7 @@ def check_errors(listener: Listener, begin_s: float) -> None:
         begin_s: when the first fault began, on the clock of the stamps.
     """
     times_s = np.array([stamp_s(one) for one in listener.heard["/truth"]])
-    for message in listener.heard["/jaxnav/core/pose"]:
+    for message in listener.heard["/jaxnav/pose"]:
         true = listener.heard["/truth"][int(np.argmin(np.abs(times_s - stamp_s(message))))]
         error_m = (pose_of(message.pose.pose) - pose_of(true.pose))[4:6]
         covariance = np.asarray(message.pose.covariance).reshape(6, 6)[:2, :2]

@@ -32,7 +32,7 @@ class Listener:
         self.heard: dict[str, list] = {}
         for kind, topic in (
             ("tf2_msgs/msg/TFMessage", "/tf"),
-            ("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/core/pose"),
+            ("geometry_msgs/msg/PoseWithCovarianceStamped", "/jaxnav/pose"),
             ("geometry_msgs/msg/PoseArray", "/jaxnav/hypotheses"),
             ("visualization_msgs/msg/MarkerArray", "/jaxnav/ghosts"),
             ("diagnostic_msgs/msg/DiagnosticArray", "/diagnostics"),
@@ -133,7 +133,7 @@ def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listene
         check_bank(listener)
         # It stays where it has arrived, and goes on to say where that is.
         listener.forget()
-        until(lambda: len(listener.heard["/jaxnav/core/pose"]) > 20, 20.0, program)
+        until(lambda: len(listener.heard["/jaxnav/pose"]) > 20, 20.0, program)
         check_saved(listener, tmp_path)
         reset = "std_srvs/srv/Trigger", "/jaxnav/reset", {}
         check_begun_anew(listener, *reset)
@@ -151,7 +151,7 @@ def test_it_drives_to_the_goal_and_tells_everybody_where_it_is(tmp_path, listene
 def check_poses(listener: Listener) -> None:
     """Poses are near the truth, and as near as they say."""
     errors_m, sigmas_m, nees = [], [], []
-    for message in listener.heard["/jaxnav/core/pose"]:
+    for message in listener.heard["/jaxnav/pose"]:
         true_m = listener.truth_at(message)
         if true_m is None:
             continue
@@ -255,8 +255,8 @@ def test_it_drives_by_the_time_of_a_simulation_and_by_lenses_that_topics_tell(tm
     file = write_file(tmp_path, rig="rig.yaml", camera_info=topics, rectified="false", **of_tf)
     words = (*PATIENT, "--ros-args", "-p", "use_sim_time:=true")
     with sim_car(tmp_path, "--clock", "--tf") as car, node(tmp_path, str(file), *words) as program:
-        until(lambda: len(listener.heard["/jaxnav/core/pose"]) > 200, 300.0, program)
-        assert 100 < stamp_s(listener.last("/jaxnav/core/pose")) < 1000  # the simulation's seconds
+        until(lambda: len(listener.heard["/jaxnav/pose"]) > 200, 300.0, program)
+        assert 100 < stamp_s(listener.last("/jaxnav/pose")) < 1000  # the simulation's seconds
         until(listener.drives, 60.0, program)
         check_pause(listener, car, program)
         # So far on a pose is sure to 5 mm: near the start 2 cm are no error.

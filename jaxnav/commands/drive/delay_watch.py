@@ -8,13 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxnav.commands.drive.observers import DriveObserver
 from jaxnav.core.models.origin import opposite, planar_in_world
 from jaxnav.drive.camera_delays import CameraDelays, Delay
 from jaxnav.drive.chassis import chassis_of
 from jaxnav.drive.corrections import Corrections
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.frames import FrameDetections, FrameIntake
-from jaxnav.drive.interfaces import Frame, Odometry
+from jaxnav.drive.frames import FrameIntake
+from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import Containment
 from jaxnav.recordings.drive_log import DriveLog
@@ -24,8 +25,8 @@ from jaxnav.recordings.drive_setup import DriveSetup
 _CLOSE_S = 20.0
 
 
-class DelayWatch:
-    """Warns once when a camera is later than its stamps say; see `Onlooker`.
+class DelayWatch(DriveObserver):
+    """Warns once when a camera is later than its stamps say.
 
     Work that takes milliseconds is done in a thread of its own, beside the loop.
     """
@@ -51,27 +52,20 @@ class DelayWatch:
 
     @property
     def faults(self) -> Fault:
-        """See `Observer`."""
         return self._faults
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
-        """See `Observer`."""
         self._delays.add_outcome(outcome)
         if self._delays.due:
             self._wake.set()
 
-    def on_frame(self, name: str, frame: Frame, sighted: FrameDetections) -> None:
-        """See `Observer`."""
-
     def close(self) -> None:
-        """See `Onlooker`."""
         self._closing = True
         self._wake.set()
         self._thread.join(_CLOSE_S)
 
     @property
     def closing_note(self) -> str | None:
-        """See `Onlooker`."""
         return "\n".join(warnings(self._delays, self._setup)) or None if self._faults else None
 
     def _run(self) -> None:
@@ -90,17 +84,17 @@ class DelayWatch:
 def warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     """A line for each camera whose stamps are surely wrong, or one line for all cameras."""
     camera_delays, together = delays.delays, delays.common_delay
-    told_s = Corrections.of(setup.vehicle).camera_delay_s
+    file_s = Corrections.of(setup.vehicle).camera_delay_s
     known = [one for one in camera_delays if one.known]
     if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
-        delay_s = told_s + together.delay_s
+        delay_s = file_s + together.delay_s
         do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
         yield f"the cameras are {describe_delay(together)}: {do}"
         return
     for name, one in zip(setup.rig.names, camera_delays, strict=True):
         if not one.late:
             continue
-        delay_s = told_s + one.delay_s
+        delay_s = file_s + one.delay_s
         yield (
             f"camera {name!r} is {describe_delay(one)}: "
             f"raise its latency_ms by {one.delay_s * 1e3:.0f}, or "

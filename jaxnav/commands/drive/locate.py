@@ -2,8 +2,10 @@
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +14,6 @@ import jaxlie
 import numpy as np
 
 from jaxnav.commands.drive.arguments import Locate
-from jaxnav.commands.drive.locate_notes import notes
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.report import normals_px, save_figure
 from jaxnav.core.filter.choose import LowestReprojection
@@ -25,14 +26,33 @@ from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
 from jaxnav.detection.acquire import acquire_in_photograph
+from jaxnav.detection.families import LARGEST_FAMILIES
 from jaxnav.errors import BadInput
+from jaxnav.files import poses
 from jaxnav.files.cameras import load_figures
-from jaxnav.files.images import read_photograph
-from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
+from jaxnav.files.images import MIRRORED, read_photograph
 
 _FREEDOM = 2  # of a marker's eight numbers: a pose has six
 _CLOSER_LOOKS = 400
 _EXCESS = 4.0  # mean square of residuals, in sigmas, beyond chance: one marker in 55 of white noise
+_LARGE_M, _SMALL_M = 1.5, 0.003  # sides that markers rarely have, and other units often make
+# What is noted of a marker beyond a limit.
+_DOUBTS = (
+    (
+        "misfit_sigmas",
+        5.0,
+        "corners are {poses[0][reprojection_error_px]:.2g} px off the pose, {misfit_sigmas:.0f} of "
+        "their sigmas, and count as {sigma_factor:.2g} times as unsure: is --camera that of this "
+        "photograph, with its zoom and focus, and is the marker flat?",
+    ),
+    (
+        "flip_probability",
+        0.3,
+        "both poses are possible (P(flip) {flip_probability:.2f}): take it from nearer, or more "
+        "from the side",
+    ),
+)
+_TURNED_DEG = {3: 180, 4: 180, 5: 90, 6: 90, 7: 270, 8: 270}  # clockwise, by EXIF's number
 
 
 def run(args: Locate) -> int:
@@ -59,22 +79,20 @@ def run(args: Locate) -> int:
         CameraRig.create([one], [jaxlie.SE3.identity()], ["camera"], [size_px])
         for one in _cameras(camera, lens_sigma_px)
     ]
-    located = [
-        _locate(rigs, args.marker_size_m, detections, index)
-        for index in np.argsort(detections.ids, kind="stable")
+    detections = detections.only(np.argsort(detections.ids, kind="stable"))
+    markers = [
+        _locate(rigs, args.marker_size_m, detections, index) for index in range(len(detections))
     ]
-    markers = [marker for marker, _ in located]
     report = {
         "image": str(args.image),
         "camera": str(args.camera),
         "family": args.family,
         "marker_size_m": args.marker_size_m,
         "markers": markers,
-        "notes": notes(args, markers, image, orientation, lens_sigma_px is not None, blurred),
+        "notes": list(notes(args, markers, image, orientation, lens_sigma_px is not None, blurred)),
     }
     if args.out is not None:
-        view = _view(image, camera, args.marker_size_m, detections, located)
-        save_figure(photo_with_poses(view), args.out, PHOTO_DPI)
+        _draw(args.out, image, camera, args.marker_size_m, markers)
     print(json.dumps(report, indent=2) if args.as_json else table(report))
     return 0
 
@@ -129,7 +147,8 @@ def _solve(rig: CameraRig, markers: MarkerMap, obs: Observation) -> tuple[Candid
 
 def _locate(
     rigs: list[CameraRig], size_m: float, detections: Detections, index: int
-) -> tuple[dict[str, Any], Candidates]:
+) -> dict[str, Any]:
+    """What is reported of a marker."""
     # The marker is the world and the camera the vehicle: T_vehicle_world is T_camera_marker.
     world = jaxlie.SE3(jaxlie.SE3.identity().wxyz_xyz[None])
     markers = MarkerMap(world, jnp.asarray([size_m]), (0,), (detections.families[index],))
@@ -152,7 +171,7 @@ def _locate(
     kept = np.flatnonzero(candidates.valid)
     errors_px = np.sqrt(candidates.e1_px2[kept] / 4)
     others = [solve(rig, factor)[0] for rig in rigs[1:]]
-    marker = {
+    return {
         "id": int(detections.ids[index]),
         "corners_px": detections.corners_px[index].tolist(),
         "corner_sigma_px": (factor * detections.sigma_px[index]).tolist(),
@@ -165,33 +184,26 @@ def _locate(
             for n, error in zip(kept, errors_px, strict=True)
         ],
     }
-    return marker, candidates
 
 
 def _lens_sigma_m(candidates: Candidates, n: int, others: list[Candidates]) -> np.ndarray:
     """How far one sigma of the lens moves the position of a pose, (3,)."""
-    moved_m = []
+    pose, moved_m = candidates.T_vehicle_world.wxyz_xyz[n], []
     for other in others:
         # The pose that is nearest to it in angle: their order may have changed.
-        turns = np.abs(
-            other.T_vehicle_world.wxyz_xyz[:, :4] @ candidates.T_vehicle_world.wxyz_xyz[n, :4]
-        )
+        turns = np.abs(other.T_vehicle_world.wxyz_xyz[:, :4] @ pose[:4])
         same = int(np.argmax(np.where(other.valid, turns, -1)))
-        moved_m.append(
-            (other.T_vehicle_world.wxyz_xyz[same] - candidates.T_vehicle_world.wxyz_xyz[n])[4:]
-        )
+        moved_m.append((other.T_vehicle_world.wxyz_xyz[same] - pose)[4:])
     return np.linalg.norm(np.reshape(moved_m, (-1, 3)), axis=0)
 
 
 def _pose(
     candidates: Candidates, n: int, error_px: float, others: list[Candidates]
 ) -> dict[str, Any]:
-    wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
-    T_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz))
-    position_m = np.asarray(T_camera_marker.translation())
-    R_camera_marker = np.asarray(T_camera_marker.rotation().as_matrix())
+    T_camera_marker = poses.matrix(np.asarray(candidates.T_vehicle_world.wxyz_xyz[n]))
+    position_m = T_camera_marker[:3, 3]
     distance_m = np.linalg.norm(position_m)
-    cosine = -R_camera_marker[:, 2] @ position_m / max(distance_m, 1e-12)
+    cosine = -T_camera_marker[:3, 2] @ position_m / max(distance_m, 1e-12)
     # The covariance is of xi in T_marker_camera * exp(xi); the marker moves by -v + position x w.
     x, y, z = position_m
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -201,7 +213,7 @@ def _pose(
     lens_sigma_m = _lens_sigma_m(candidates, n, others)
     rotation_sigma_deg = np.rad2deg(np.sqrt(np.diag(covariance)[3:]))
     return {
-        "T_camera_marker": np.asarray(T_camera_marker.as_matrix()).tolist(),
+        "T_camera_marker": T_camera_marker.tolist(),
         "distance_m": float(distance_m),
         "view_angle_deg": float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))),
         "reprojection_error_px": float(error_px),
@@ -212,59 +224,128 @@ def _pose(
     }
 
 
+def notes(
+    args: Locate,
+    markers: Sequence[dict[str, Any]],
+    image: np.ndarray,
+    orientation: int,
+    knows_lens: bool,
+    blurred: bool,
+) -> Iterator[str]:
+    """What a person should know of a photograph before trusting its poses.
+
+    Args:
+        markers: as in the report.
+        orientation: of the photograph, 1 to 8, as EXIF counts.
+        knows_lens: whether the camera's file has sigmas of its lens.
+        blurred: whether no marker could be read without restoring the photograph.
+    """
+    size_m = args.marker_size_m
+    if size_m > _LARGE_M:
+        other = f"{size_m / 1000:g} if {size_m:g} are mm, {size_m / 100:g} if they are cm"
+        yield f"--marker-size-m {size_m:g} is {size_m:g} m: {other}"
+    elif size_m < _SMALL_M:
+        other = f"{1000 * size_m:g} if it was divided by 1000 twice"
+        yield f"--marker-size-m {size_m:g} is {size_m:g} m: {other}"
+    if orientation != 1:
+        turned = f"turned by {_TURNED_DEG[orientation]} deg" if orientation in _TURNED_DEG else ""
+        mirrored = "mirrored" if orientation in MIRRORED else ""
+        shown = " and ".join(filter(None, (mirrored, turned)))
+        yield (
+            f"viewers show this photograph {shown} (EXIF); x (right) and y (down) are those of the "
+            "pixels as the camera stored them"
+        )
+    if not markers:
+        yield from _other_family(args, image)
+    elif blurred:
+        yield (
+            "the photograph is blurred by a motion: ids were read in a restored one, and corners "
+            "fitted to the photograph as it is"
+        )
+    for marker in markers:
+        if not marker["poses"]:
+            yield f"marker {marker['id']}: no pose explains its corners"
+    for key, limit, text in _DOUBTS:
+        if beyond := [marker for marker in markers if marker[key] > limit]:
+            worst = max(beyond, key=lambda marker: marker[key])
+            many = len(beyond) > 1
+            name = f"{len(beyond)} markers, {worst['id']} most of all" if many else "marker {id}"
+            yield f"{name}: {text}".format(**worst)
+    for number, count in sorted(Counter(marker["id"] for marker in markers).items()):
+        if count > 1:
+            one = "at most one of them is the one that you mean"
+            yield f"marker {number} is seen {count} times: {one}"
+    if markers and not knows_lens:
+        yield (
+            f"--camera {args.camera.name} has no sigmas of its lens, so sigma (m) leaves out what "
+            "its focal length and centre are wrong: `jaxnav calibrate intrinsics` writes them"
+        )
+
+
+def _other_family(args: Locate, image: np.ndarray) -> Iterator[str]:
+    """The family of which the photograph shows most markers instead."""
+    seen = {}
+    for family in LARGEST_FAMILIES:
+        if family != args.family:
+            found = make_detector("aruco", family).detect(image)
+            seen[family] = found.ids[found.refined]
+    family = max(seen, key=lambda one: len(seen[one]))
+    if len(seen[family]):
+        ids = ", ".join(map(str, sorted(set(seen[family].tolist()))[:6]))
+        yield f"{len(seen[family])} of {family} in view (id {ids}): --family {family}"
+
+
 def table(report: dict[str, Any]) -> str:
     """The report as text, a line for each pose."""
     said = [f"note: {sentence}" for sentence in report["notes"]]
     if not report["markers"]:
         none = f"{report['image']}: no marker of {report['family']} in view"
         return "\n".join([none, *said])
-    head = (
+    lines = [
         f"{'id':>5} {'pose':>4} {'x (m)':>8} {'y (m)':>8} {'z (m)':>8} {'view (deg)':>10} "
         f"{'error (px)':>10} {'ratio':>6} {'P(flip)':>8} {'sigma (m)':>9} {'sigma (deg)':>11}"
-    )
-    lines = [head]
+    ]
     for marker in report["markers"]:
-        for number, pose in enumerate(marker["poses"], 1):
+        number, doubt, error_ratio = marker["id"], marker["flip_probability"], marker["error_ratio"]
+        ratio = "" if error_ratio is None else f"{error_ratio:.2f}"
+        of_marker = f"{number:>5}", f"{ratio:>6} {doubt:>8.3f}"  # in the line of its first pose
+        for rank, pose in enumerate(marker["poses"], 1):
+            id_text, doubt_text = of_marker if rank == 1 else (" " * 5, " " * 15)
             x, y, z = (row[3] for row in pose["T_camera_marker"][:3])
-            ratio = (
-                ""
-                if number > 1 or marker["error_ratio"] is None
-                else (f"{marker['error_ratio']:.2f}")
-            )
-            doubt = f"{marker['flip_probability']:.3f}" if number == 1 else ""
             lines.append(
-                f"{marker['id'] if number == 1 else '':>5} {number:>4} {x:>8.3f} {y:>8.3f} "
-                f"{z:>8.3f} {pose['view_angle_deg']:>10.1f} "
-                f"{pose['reprojection_error_px']:>10.3f} {ratio:>6} {doubt:>8} "
-                f"{np.linalg.norm(pose['position_sigma_m']):>9.4f} "
+                f"{id_text} {rank:>4} {x:>8.3f} {y:>8.3f} {z:>8.3f} "
+                f"{pose['view_angle_deg']:>10.1f} {pose['reprojection_error_px']:>10.3f} "
+                f"{doubt_text} {np.linalg.norm(pose['position_sigma_m']):>9.4f} "
                 f"{np.linalg.norm(pose['rotation_sigma_deg']):>11.2f}"
             )
     return "\n".join([*lines, *said])
 
 
-def _view(
+def _draw(
+    path: Path,
     image: np.ndarray,
     camera: Camera,
     size_m: float,
-    detections: Detections,
-    located: list[tuple[dict[str, Any], Candidates]],
-) -> AnnotatedFrame:
+    markers: Sequence[dict[str, Any]],
+) -> None:
+    """Draw the markers and both poses of each into the photograph."""
+    # It imports matplotlib.
+    from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
+
     sticks: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for _, candidates in located:
-        for rank, n in enumerate(np.flatnonzero(candidates.valid)[:2]):
-            wxyz_xyz = candidates.T_vehicle_world.wxyz_xyz[n]
-            Ts_camera_marker = jaxlie.SE3(jnp.asarray(wxyz_xyz)[None])
+    for marker in markers:
+        for rank, pose in enumerate(marker["poses"][:2]):
+            Ts_camera_marker = jaxlie.SE3.from_matrix(jnp.asarray([pose["T_camera_marker"]]))
             sticks[rank].append(normals_px(camera, Ts_camera_marker, np.array([size_m]))[0])
-    names = tuple(
-        f"{marker['id']}: {marker['poses'][0]['distance_m']:.2f} m" if marker["poses"] else ""
-        for marker, _ in located
-    )
-    order = np.argsort(detections.ids, kind="stable")
-    return AnnotatedFrame(
+    view = AnnotatedFrame(
         title="",
         image=image[:, :, ::-1],
-        detected_px=detections.corners_px[order],
-        selected_px=np.asarray(sticks[0]).reshape(-1, 2, 2),
-        other_px=np.asarray(sticks[1]).reshape(-1, 2, 2),
-        names=names,
+        detected_px=np.reshape([marker["corners_px"] for marker in markers], (-1, 4, 2)),
+        selected_px=np.reshape(sticks[0], (-1, 2, 2)),
+        other_px=np.reshape(sticks[1], (-1, 2, 2)),
+        names=tuple(
+            f"{marker['id']}: {marker['poses'][0]['distance_m']:.2f} m" if marker["poses"] else ""
+            for marker in markers
+        ),
     )
+    save_figure(photo_with_poses(view), path, PHOTO_DPI)

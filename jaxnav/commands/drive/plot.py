@@ -9,7 +9,7 @@ import numpy as np
 from jaxnav.commands.reading import read_shown
 from jaxnav.commands.report import save_figure
 from jaxnav.commands.study.arguments import Plot as Arguments
-from jaxnav.drive.flags import Fault, Health, Reject
+from jaxnav.drive.flags import Fault, Health, Reject, counts
 from jaxnav.drive.interfaces import Odometry, Reading
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder
@@ -73,13 +73,14 @@ def summary_lines(log: DriveLog) -> list[str]:
         for state in Health
     }
     healths = ", ".join(f"{name} {share:.1%}" for name, share in shares.items() if share > 0)
-    faults = _counted(Fault, outcomes.faults) + _counted(Reject, outcomes.rejects)
+    found = counts(Fault, outcomes.faults) | counts(Reject, outcomes.rejects)
+    faults = ", ".join(f"{name} {number}" for name, number in found.items())
     restarts = int(outcomes.restarts[-1])
     reason = f", the last one: {outcomes.reason[-1]}" if restarts else ""
     lines = [
         f"{duration_s:.1f} s, {count} outcomes, {distance_m(log):.2f} m by the odometer",
         f"health by time: {healths}",
-        f"outcomes with faults: {', '.join(faults) or 'none'}",
+        f"outcomes with faults: {faults or 'none'}",
         f"restarts: {restarts}{reason}",
     ]
     if log.missing:
@@ -108,8 +109,3 @@ def _speed_mps(reading: Reading) -> float:
     if isinstance(reading, Odometry):
         return reading.speed_mps
     return math.hypot(reading.forward_mps, reading.left_mps)
-
-
-def _counted(kind: type[Fault] | type[Reject], values: np.ndarray) -> list[str]:
-    counts = {flag.name: int(np.sum((values & flag.value) > 0)) for flag in kind}
-    return [f"{name} {count}" for name, count in counts.items() if count]

@@ -1,10 +1,11 @@
 """`jaxnav replay`: localise a recorded rig in every frame, or drive a recorded drive again."""
 
 import dataclasses
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive import replay_drive
@@ -25,28 +26,23 @@ from jaxnav.files import (
     write_json,
     write_tum,
 )
-from jaxnav.pictures.localisation import localisation_report
-from jaxnav.recordings.other.odometry_delay import OdometryDelay, odometry_delay
+from jaxnav.recordings.other.odometry_delay import odometry_delay
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
 
-DEFAULT_SELECTOR: Selector = "multi-hypothesis"
-SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history
+_DEFAULT_SELECTOR: Selector = "multi-hypothesis"
+_SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history
 
 
 def run(args: Arguments) -> int:
     """Localise the rig, write the trajectory, and its errors where there is a reference."""
     if replay_drive.is_for(args):
         return replay_drive.run(args)
-    args = dataclasses.replace(args, selector=args.selector or DEFAULT_SELECTOR)
+    args = dataclasses.replace(args, selector=args.selector or _DEFAULT_SELECTOR)
     configure_jax(float64=True, threads=1)
-    params = None if args.params is None else load_params(args.params)
-    recording = read_recording(
-        args.recording,
-        None if args.rig is None else load_rig(args.rig),
-        None if args.markers is None else load_markers(args.markers),
-        None if args.topics is None else load_topics(args.topics),
-    )
+    params = _loaded(load_params, args.params)
+    files = (load_rig, args.rig), (load_markers, args.markers), (load_topics, args.topics)
+    recording = read_recording(args.recording, *(_loaded(*file) for file in files))
     if args.limit is not None:
         recording = recording.first(args.limit)
     if args.without_odometry:
@@ -71,27 +67,27 @@ def run(args: Arguments) -> int:
             params=params,
             smooth=args.smooth,
         )
-    summary = summarise(args, recording, result)
+    summary = _summary(args, recording, result)
     _write_tracks(args, recording, result)
-    save_figure(_report(args, recording, result, summary), out / "report.png")
+    _draw(recording, result, _text(summary), out / "report.png")
     write_json(out / "summary.json", summary)
     print(_text(summary))
-    if (delay := _delay_of_odometry(recording, result)) is not None:
-        print(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
+    if recording.odometry is not None:
+        track = int(np.argmax(result.seen.sum(axis=0)))  # the one that sees most
+        poses, seen = result.T_world_vehicle[:, track], result.seen[:, track]
+        delay = odometry_delay(recording.odometry, recording.stamps_ns, poses, seen)
+        if delay is not None:
+            print(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
     print(f"report in {visible(out)}")
     return 0
 
 
-def _delay_of_odometry(recording: Recording, result: Replay) -> OdometryDelay | None:
-    """By how much the stamps of its odometry are off; of the track that sees most."""
-    if recording.odometry is None:
-        return None
-    track = int(np.argmax(result.seen.sum(axis=0)))
-    poses, seen = result.T_world_vehicle[:, track], result.seen[:, track]
-    return odometry_delay(recording.odometry, recording.stamps_ns, poses, seen)
+def _loaded(load: Callable[[Path], Any], path: Path | None) -> Any:
+    """The content of a file; None where none is given."""
+    return None if path is None else load(path)
 
 
-def summarise(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:
+def _summary(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:
     """The content of summary.json: counts, speed and, with a reference, errors and branches."""
     summary: dict[str, Any] = {
         "recording": recording.name,
@@ -122,7 +118,7 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
     assert recording.reference is not None
     position_m, rotation_deg = errors(result, recording)
     judged = result.seen & recording.reference.valid[:, None]
-    settled = judged & (frames_in_view(result.seen) > SETTLED_FRAMES)
+    settled = judged & (frames_in_view(result.seen) > _SETTLED_FRAMES)
 
     wrong, outlier = np.asarray(result.branch.wrong), np.asarray(result.branch.outlier)
 
@@ -134,7 +130,7 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
         "position_error_m": _spread(position_m),
         "rotation_error_deg": _spread(rotation_deg),
         "wrong_branch_fraction": fraction(wrong, judged),
-        f"wrong_branch_fraction_after_{SETTLED_FRAMES}_frames": fraction(wrong, settled),
+        f"wrong_branch_fraction_after_{_SETTLED_FRAMES}_frames": fraction(wrong, settled),
         "outlier_fraction": fraction(outlier, judged),
     }
 
@@ -153,8 +149,8 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
         name = "trajectory"
         if args.one_at_a_time:
             name = f"trajectory_marker_{recording.markers.ids[track]}"
-        told = (result.located if args.smooth else result.seen)[:, track]
-        write_tum(args.out / f"{name}.tum", stamps_s[told], result.T_world_vehicle[told, track])
+        known = (result.located if args.smooth else result.seen)[:, track]
+        write_tum(args.out / f"{name}.tum", stamps_s[known], result.T_world_vehicle[known, track])
     if recording.reference is not None:
         valid = recording.reference.valid
         write_tum(
@@ -162,9 +158,10 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
         )
 
 
-def _report(
-    args: Arguments, recording: Recording, result: Replay, summary: dict[str, Any]
-) -> Figure:
+def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
+    # It imports matplotlib, which a drive that is compared needs not.
+    from jaxnav.pictures.localisation import localisation_report
+
     times_s = (recording.stamps_ns - recording.stamps_ns[0]) / 1e9
     # Tracks one after the other, so that every pose is drawn.
     positions_m = np.where(result.seen[..., None], result.T_world_vehicle[..., 4:], np.nan)
@@ -173,20 +170,19 @@ def _report(
     if recording.reference is not None:
         valid = recording.reference.valid[:, None]
         reference_m = np.where(valid, recording.reference.T_world_vehicle[:, 4:], np.nan)
-        position_m, rotation_deg = errors(result, recording)
-        drawn = {
-            "position error (m)": position_m.T.ravel(),
-            "rotation error (deg)": rotation_deg.T.ravel(),
-        }
-    return localisation_report(
+        names = "position error (m)", "rotation error (deg)"
+        off = errors(result, recording)
+        drawn = {name: values.T.ravel() for name, values in zip(names, off, strict=True)}
+    picture = localisation_report(
         np.tile(times_s, tracks),
         positions_m.transpose(1, 0, 2).reshape(-1, 3),
         reference_m,
         drawn,
         corners_in_world(recording.markers),
-        title=_text(summary),
+        title=title,
         connected=tracks == 1,
     )
+    save_figure(picture, path)
 
 
 def _text(summary: dict[str, Any]) -> str:

@@ -1,25 +1,23 @@
 """`jaxnav replay` of a drive: run the pilot on recorded inputs, and compare its outcomes."""
 
 import dataclasses
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from matplotlib.figure import Figure
+from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
-from jaxnav.commands.drive import replay_smoothed
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import flag_of
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.commands.report import corners_in_world, save_figure
-from jaxnav.drive.flags import Fault, Health, Reject, names
-from jaxnav.drive.pilot import Input, Outcome
+from jaxnav.drive.flags import Fault, Health, Reject, counts
+from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import (
     Params,
@@ -31,7 +29,6 @@ from jaxnav.files import (
     write_tum,
 )
 from jaxnav.files.configuration import step_folder
-from jaxnav.pictures.localisation import localisation_report
 from jaxnav.recordings.drive_events import DriveEvents, refused_odometry
 from jaxnav.recordings.drive_format import PROFILE
 from jaxnav.recordings.drive_log import DriveLog, profile_of
@@ -43,7 +40,7 @@ from jaxnav.recordings.drive_replay import (
 )
 from jaxnav.recordings.drive_setup import DriveSetup, needs_float64
 from jaxnav.recordings.other.ros import read_ros_drive
-from jaxnav.recordings.other.smoothed_drive import distances
+from jaxnav.recordings.other.smoothed_drive import DriveTrack, distances, smooth_drive
 from jaxnav.recordings.plausible import keep_plausible
 from jaxnav.recordings.recorder import Recorder
 from jaxnav.recordings.records import Outcomes
@@ -52,10 +49,7 @@ EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
 _FOR_RIGS = ("one_at_a_time", "without_odometry")
 _FOR_DRIVES = ("vehicle", "route", "images", "record_anew")
-_OVERRIDES = (
-    *("rig", "markers", "vehicle", "route", "params"),
-    *("selector", "corner_sigma_px", "images"),
-)
+_OVERRIDES = (*_FILES, "params", "selector", "corner_sigma_px", "images")
 
 
 @dataclass(frozen=True)
@@ -63,12 +57,11 @@ class Track:
     """The track of a drive that is driven again: N rows in the order of their outcomes.
 
     Attributes:
-        now_ns: when each input reached the pilot, (N,).
-        poses: (N, 3), x_m y_m psi_rad.
-        Ts_world_vehicle: (N, 7) wxyz_xyz.
-        located, decided: (N,) bool.
-        health, faults, rejects: of each outcome.
-        restarts, restart_reason: at the end.
+        now_ns: when each input reached the pilot.
+        poses: x_m y_m psi_rad.
+        Ts_world_vehicle: wxyz_xyz.
+        health, faults, rejects: values of `Health`, `Fault` and `Reject`.
+        restarts, restart_reason: how many so far, and why the last one.
     """
 
     now_ns: Int[np.ndarray, " N"]
@@ -76,57 +69,38 @@ class Track:
     Ts_world_vehicle: Float[np.ndarray, "N 7"]
     located: Bool[np.ndarray, " N"]
     decided: Bool[np.ndarray, " N"]
-    health: Sequence[Health]
-    faults: Sequence[Fault]
-    rejects: Sequence[Reject]
-    restarts: int
-    restart_reason: str
-
-    @property
-    def times_s(self) -> Float[np.ndarray, " N"]:
-        """Times since the first row, (N,) s."""
-        return np.asarray((self.now_ns - self.now_ns[0]) / 1e9)
-
-    @property
-    def positions_m(self) -> Float[np.ndarray, "N 3"]:
-        """Positions of the vehicle, (N, 3) m, NaN where not located."""
-        return np.where(self.located[:, None], self.Ts_world_vehicle[:, 4:], np.nan)
+    health: Int[np.ndarray, " N"]
+    faults: Int[np.ndarray, " N"]
+    rejects: Int[np.ndarray, " N"]
+    restarts: Int[np.ndarray, " N"]
+    restart_reason: Shaped[np.ndarray, " N"]
 
     def summary(self) -> dict[str, Any]:
         """Counts of faults and rejects, shares of health, and the last pose and restarts."""
-        count, healths = len(self.health), Counter(self.health)
         return {
-            "states": count,
-            "duration_s": float(self.times_s[-1]),
-            "health_shares": {h.name: healths[h] / count for h in Health},
+            "states": len(self.health),
+            "duration_s": float((self.now_ns[-1] - self.now_ns[0]) / 1e9),
+            "health_shares": {h.name: float(np.mean(self.health == h)) for h in Health},
             "located_share": float(np.mean(self.located)),
             "decided_share": float(np.mean(self.decided)),
-            "faults": dict(Counter(name for one in self.faults for name in names(one))),
-            "rejects": dict(Counter(name for one in self.rejects for name in names(one))),
+            "faults": counts(Fault, self.faults),
+            "rejects": counts(Reject, self.rejects),
             "final_pose": self.poses[-1] if self.located[-1] else None,
-            "restarts": self.restarts,
-            "restart_reason": self.restart_reason,
+            "restarts": int(self.restarts[-1]),
+            "restart_reason": str(self.restart_reason[-1]),
         }
 
     def distances_to(
         self, recorded: Outcomes
     ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
         """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
+        if not len(recorded.now_ns):
+            return np.full(len(self.now_ns), np.nan), np.full(len(self.now_ns), np.nan)
         index = np.searchsorted(recorded.now_ns, self.now_ns)
         known = index < len(recorded.now_ns)
         index = np.where(known, index, 0)
-        if not len(recorded.now_ns):
-            return np.full(len(index), np.nan), np.full(len(index), np.nan)
         known &= (recorded.now_ns[index] == self.now_ns) & recorded.located[index] & self.located
         return distances(self.poses, recorded.pose[index], known)
-
-    def rms_differences(self, recorded: Outcomes) -> dict[str, Any]:
-        """Root mean square differences from the recorded track."""
-        shift_m, turn_rad = self.distances_to(recorded)
-        return {
-            "rms_position_difference_m": replay_smoothed.rms(shift_m),
-            "rms_heading_difference_deg": np.rad2deg(replay_smoothed.rms(turn_rad)),
-        }
 
 
 def is_for(args: Arguments) -> bool:
@@ -138,30 +112,28 @@ def is_for(args: Arguments) -> bool:
     path = args.recording
     moves_freely = args.topics is not None and load_topics(args.topics).imu is not None
     if moves_freely and not (args.vehicle or args.route):
-        for name in _FOR_DRIVES:
-            if getattr(args, name):
-                raise BadInput(flag_of(name), f"is for drives, and {path} with an IMU is a rig's")
+        _refuse(args, _FOR_DRIVES, f"is for drives, and {path} with an IMU is a rig's")
         return False
     if args.topics is not None or profile_of(path) == PROFILE:
-        for name in _FOR_RIGS:
-            if getattr(args, name):
-                raise BadInput(flag_of(name), "goes with recordings of a rig, not with a drive")
+        _refuse(args, _FOR_RIGS, "goes with recordings of a rig, not with a drive")
         return True
-    if path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file():
-        if path.exists():
-            problem = f"missing: {path} is a ROS bag: they say which topic is what"
-            raise BadInput("--topics", problem)
-    for name in _FOR_DRIVES:
-        if getattr(args, name):
-            raise BadInput(flag_of(name), f"is for drives, and {path} is none")
+    is_bag = path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").is_file()
+    if is_bag and path.exists():
+        raise BadInput("--topics", f"missing: {path} is a ROS bag: they say which topic is what")
+    _refuse(args, _FOR_DRIVES, f"is for drives, and {path} is none")
     return False
+
+
+def _refuse(args: Arguments, names: Sequence[str], problem: str) -> None:
+    for name in names:
+        if getattr(args, name):
+            raise BadInput(flag_of(name), problem)
 
 
 def run(args: Arguments) -> int:
     """Drive again, compare, write a summary and the trajectory; 1 where outcomes differ."""
     params = None if args.params is None else load_params(args.params)
-    load = _own_drive if args.topics is None else _ros_drive
-    log, setup, inputs = load(args, params)
+    log, setup, inputs = _read(args, params)
     inputs = inputs[: args.limit]
     if not inputs:
         raise BadInput(args.recording, "holds no input")
@@ -182,11 +154,18 @@ def run(args: Arguments) -> int:
         "parameters": setup.parameters,
     }
     summary |= track.summary()
-    recorded = None
+    recorded_m, off = None, None
     if log is not None:
-        summary |= {"changed": changed, "missing": log.missing, "truncated": log.truncated}
         recorded = keep_plausible(log.outcomes)[0]
-        summary |= track.rms_differences(recorded)
+        off = track.distances_to(recorded)
+        recorded_m = np.where(recorded.located[:, None], recorded.pose * [1, 1, 0], np.nan)
+        summary |= {
+            "changed": changed,
+            "missing": log.missing,
+            "truncated": log.truncated,
+            "rms_position_difference_m": _rms(off[0]),
+            "rms_heading_difference_deg": np.rad2deg(_rms(off[1])),
+        }
     if comparison is not None:
         summary |= {
             "compared": comparison.compared,
@@ -194,54 +173,48 @@ def run(args: Arguments) -> int:
             "first_difference": comparison.first and dataclasses.asdict(comparison.first),
         }
     else:
-        save_figure(_picture(setup, track, recorded, _text(summary)), out / "report.png")
-    smoothing = ""
+        positions_m = np.where(track.located[:, None], track.Ts_world_vehicle[:, 4:], np.nan)
+        times_s = (track.now_ns - track.now_ns[0]) / 1e9
+        path = out / "report.png"
+        _draw(path, setup, times_s, positions_m, recorded_m, off, _text(summary))
+    text = _text(summary)
     if events is not None:
-        summary["smoothing"] = replay_smoothed.run(args, events, setup)
-        smoothing = f"\n{replay_smoothed.text(summary['smoothing'])}"
+        summary["smoothing"] = _smooth(args, events, setup)
+        text += f"\n{_smoothing_text(summary['smoothing'])}"
     write_json(out / "summary.json", summary)
     located = track.located
     write_tum(out / "trajectory.tum", track.now_ns[located] / 1e9, track.Ts_world_vehicle[located])
-    print(f"{_text(summary)}{smoothing}")
+    print(text)
     print(f"summary in {visible(out)}")
     return EXIT_DIFFERS if comparison is not None and comparison.first else 0
 
 
-_Drive = tuple[DriveLog | None, DriveSetup, Sequence[Input]]
-
-
-def _own_drive(args: Arguments, params: Params | None) -> _Drive:
-    log = read_shown(args.recording, args.headless)
-    configure_jax(float64=needs_float64(log.header, args.recording), threads=1)
-    setup = DriveSetup.from_header(log.header, args.recording)
-    setup = _tuned(dataclasses.replace(setup, **given_files(args, _FILES)), args, params)
-    if args.images:
-        return log, setup, inputs_from_images(log, setup, args.corner_backend)[0]
-    return log, setup, log.inputs
-
-
-def _ros_drive(args: Arguments, params: Params | None) -> _Drive:
-    configure_jax(float64=True, threads=1)
-    assert args.topics is not None
-    files = given_files(args, _FILES, bag=args.recording)
-    setup = _tuned(DriveSetup(**files, float64=True), args, params)
-    inputs = read_ros_drive(
-        args.recording,
-        load_topics(args.topics),
-        setup.rig,
-        setup.markers,
-        setup.vehicle,
-        args.corner_backend,
-    )
-    return None, setup, inputs
-
-
-def _tuned(setup: DriveSetup, args: Arguments, params: Params | None) -> DriveSetup:
-    """The setup with what the arguments give in place of its own figures."""
+def _read(
+    args: Arguments, params: Params | None
+) -> tuple[DriveLog | None, DriveSetup, Sequence[Input]]:
+    """The recorded drive (None of a bag), what is driven with, and the inputs."""
+    log = None
+    if args.topics is None:
+        log = read_shown(args.recording, args.headless)
+        configure_jax(float64=needs_float64(log.header, args.recording), threads=1)
+        setup = DriveSetup.from_header(log.header, args.recording)
+        setup = dataclasses.replace(setup, **given_files(args, _FILES))
+    else:
+        configure_jax(float64=True, threads=1)
+        setup = DriveSetup(**given_files(args, _FILES, bag=args.recording), float64=True)
     for name in ("selector", "corner_sigma_px"):
         if getattr(args, name) is not None:
             setup = dataclasses.replace(setup, **{name: getattr(args, name)})
-    return setup if params is None else setup.with_params(params)
+    if params is not None:
+        setup = setup.with_params(params)
+    if args.topics is not None:
+        topics, backend = load_topics(args.topics), args.corner_backend
+        figures = setup.rig, setup.markers, setup.vehicle
+        return None, setup, read_ros_drive(args.recording, topics, *figures, backend)
+    assert log is not None
+    if args.images:
+        return log, setup, inputs_from_images(log, setup, args.corner_backend)[0]
+    return log, setup, log.inputs
 
 
 def _replayed(
@@ -262,7 +235,12 @@ def _replayed(
         )
         update = update_after_compiling(bar)
         for given, outcome in zip(inputs, outcomes, strict=True):
-            rows.append(_row(outcome))
+            # Not the bank of hypotheses: those of a long drive are gigabytes.
+            output, reason = outcome.output, outcome.restart_reason
+            poses = np.asarray(outcome.pose, float), np.asarray(outcome.T_world_vehicle, float)
+            known = bool(output.located), bool(output.decided)
+            flags = int(outcome.health), int(outcome.faults), int(outcome.rejects)
+            rows.append((outcome.now_ns, *poses, *known, *flags, outcome.restarts, reason))
             if comparison is not None:
                 comparison.look(outcome)
             if recorder is not None:
@@ -272,58 +250,37 @@ def _replayed(
             recorder.close(timeout_s=60.0)
             if recorder.failed is not None:
                 raise BadInput("--record-anew", recorder.failed.replace(str(beside), str(path)))
-    columns: list[Any] = list(zip(*rows, strict=True))
-    now_ns, poses, Ts, located, decided, health, faults, rejects, restarts, reasons = columns
-    return Track(
-        np.array(now_ns, np.int64),
-        np.stack(poses),
-        np.stack(Ts),
-        np.array(located),
-        np.array(decided),
-        health,
-        faults,
-        rejects,
-        restarts[-1],
-        reasons[-1],
-    )
+    return Track(*map(np.array, zip(*rows, strict=True)))
 
 
-def _row(outcome: Outcome) -> tuple[Any, ...]:
-    """The part of an outcome that a `Track` keeps, without its bank of hypotheses."""
-    output = outcome.output
-    return (
-        outcome.now_ns,
-        np.asarray(outcome.pose, float),
-        np.asarray(outcome.T_world_vehicle, float),
-        bool(output.located),
-        bool(output.decided),
-        outcome.health,
-        outcome.faults,
-        outcome.rejects,
-        outcome.restarts,
-        outcome.restart_reason,
-    )
+def _draw(
+    path: Path,
+    setup: DriveSetup,
+    times_s: np.ndarray,
+    positions_m: np.ndarray,
+    others_m: np.ndarray | None,
+    off: tuple[np.ndarray, np.ndarray] | None,
+    title: str,
+    names: tuple[str, str] = ("estimate", "reference"),
+) -> None:
+    """Draw a track and another one beside it, which is off by m and rad."""
+    # It imports matplotlib.
+    from jaxnav.pictures.localisation import localisation_report
 
-
-def _picture(setup: DriveSetup, track: Track, recorded: Outcomes | None, title: str) -> Figure:
-    recorded_m, drawn = None, {}
-    if recorded is not None:
-        shift_m, turn_rad = track.distances_to(recorded)
-        # A logarithmic axis shows no zero: 1e-9 stands for it.
-        drawn = {
-            "position off (m)": np.maximum(shift_m, 1e-9),
-            "heading off (deg)": np.maximum(np.rad2deg(turn_rad), 1e-9),
-        }
-        recorded_m = np.where(recorded.located[:, None], recorded.pose, np.nan)
-        recorded_m[:, 2] = 0.0
-    return localisation_report(
-        track.times_s,
-        track.positions_m,
-        recorded_m,
-        drawn,
+    shown = {}
+    if off is not None:
+        shown = {"position off (m)": off[0], "heading off (deg)": np.rad2deg(off[1])}
+    picture = localisation_report(
+        times_s,
+        positions_m,
+        others_m,
+        # A logarithmic axis shows no zero.
+        {name: np.where(values > 0, values, np.nan) for name, values in shown.items()},
         corners_in_world(setup.markers),
         title=title,
+        names=names,
     )
+    save_figure(picture, path)
 
 
 def _text(summary: dict[str, Any]) -> str:
@@ -357,3 +314,70 @@ def _verdict(summary: dict[str, Any]) -> str:
     if summary["bit_for_bit"]:
         return f"{compared} states, bit for bit as recorded"
     return f"{compared} states, as recorded but for rounding (by another version or machine)"
+
+
+def _smooth(args: Arguments, events: DriveEvents, setup: DriveSetup) -> dict[str, Any]:
+    """Write the track by all that was seen, smoothed.tum and smoothed.png; what it has changed."""
+    with progress_bar(
+        total=2 * len(events), unit="event", desc="smooth", disable=args.headless
+    ) as bar:
+        filtered, smoothed = smooth_drive(events, setup, update_after_compiling(bar))
+    stamps_s, located = smoothed.stamps_ns / 1e9, smoothed.located
+    write_tum(args.out / "smoothed.tum", stamps_s[located], smoothed.Ts_world_vehicle[located])
+    shift_m, turn_rad = filtered.distances_to(smoothed)
+    summary = {
+        "events": len(events),
+        "filtered": _known(filtered),
+        "smoothed": _known(smoothed),
+        "rms_position_difference_m": _rms(shift_m[filtered.decided]),
+        "rms_heading_difference_deg": _rms(np.rad2deg(turn_rad[filtered.decided])),
+    }
+    _draw(
+        args.out / "smoothed.png",
+        setup,
+        stamps_s - stamps_s[0],
+        filtered.positions_m,
+        smoothed.positions_m,
+        (shift_m, turn_rad),
+        _smoothing_text(summary),
+        ("filtered", "smoothed"),
+    )
+    return summary
+
+
+def _smoothing_text(summary: dict[str, Any]) -> str:
+    """What smoothing has changed, in two lines."""
+    shares = (summary[of]["decided_share"] for of in ("filtered", "smoothed"))
+    before, after = (_sigmas(summary[of]) for of in ("filtered", "smoothed"))
+    off_cm = 100 * summary["rms_position_difference_m"]
+    decided = "decided {:.0%} of {} events, smoothed {:.0%}"
+    first, second = shares
+    return (
+        f"{decided.format(first, summary['events'], second)}; sigma {before}, smoothed {after}\n"
+        f"once decided, the filter was off the smoothed track by {off_cm:.2g} cm and "
+        f"{summary['rms_heading_difference_deg']:.2g} deg (rms)"
+    )
+
+
+def _known(track: DriveTrack) -> dict[str, float]:
+    """Shares of the events, and how well the pose is known where it is decided."""
+    return {
+        "located_share": float(np.mean(track.located)),
+        "decided_share": float(np.mean(track.decided)),
+        "median_sigma_m": _median(track.sigma_m[track.decided]),
+        "median_sigma_deg": _median(np.rad2deg(track.sigma_rad[track.decided])),
+    }
+
+
+def _sigmas(known: dict[str, float]) -> str:
+    return f"{100 * known['median_sigma_m']:.2g} cm {known['median_sigma_deg']:.2g} deg"
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else np.nan
+
+
+def _rms(values: np.ndarray) -> float:
+    """The root mean square of those that are finite; NaN of none."""
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if len(values) else np.nan

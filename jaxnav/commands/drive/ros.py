@@ -15,7 +15,7 @@ from typing import Any
 from jaxnav.commands.drive.arguments import Ros
 from jaxnav.commands.drive.ros_body import PreparedBody
 from jaxnav.commands.drive.ros_drive import OVER, PreparedDrive
-from jaxnav.commands.drive.ros_setup import Activity
+from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared
 from jaxnav.commands.process import configure_jax
 from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput, visible
@@ -24,7 +24,6 @@ from jaxnav.files.executables import keep_in
 from jaxnav.files.ros import load_ros
 from jaxnav.vehicles.ros.connection import Connection
 
-_LOOK_S = 0.05
 _CLOCK_S = 10.0  # for the first message of /clock
 EXIT_STOPPED = 1
 
@@ -45,7 +44,7 @@ def run(args: Ros, signals: Signals) -> int:
         node.connection.run()
         while args.managed or node.ended is None:
             signals.check()
-            time.sleep(_LOOK_S)
+            time.sleep(LOOK_S)
         return 0 if node.ended == OVER else EXIT_STOPPED
     finally:
         node.close()
@@ -60,7 +59,7 @@ class _Node:
 
     def __init__(self, args: Ros, signals: Signals):
         self._args, self._signals = args, signals
-        self._prepared: PreparedDrive | PreparedBody | None = None
+        self._prepared: Prepared | None = None
         self._activity: Activity | None = None
         self._problem: BadInput | None = None
         self.ended: str | None = None
@@ -76,7 +75,7 @@ class _Node:
         self._node: Any = self.connection.node
         given = self._node.declare_parameter("file", "").value
         self._file = str(args.file or given)
-        self.connection.every(_LOOK_S, "the end of the drive", self._look)
+        self.connection.every(LOOK_S, "the end of the drive", self._look)
         for kind, name, *answers in (
             ("std_srvs/srv/Trigger", "~/reset", self._reset),
             ("jaxnav_msgs/srv/LoadMarkers", "~/load_markers", self._take_markers, self._load),
@@ -101,7 +100,7 @@ class _Node:
         self._cleanup()
         self.connection.close()
 
-    def took(self, transition: str) -> bool:
+    def change_state(self, transition: str) -> bool:
         """Go through a transition; whether it went well. Called in the thread of ROS."""
         try:
             getattr(self, f"_{transition}")()
@@ -164,7 +163,7 @@ class _Node:
         finally:
             self.ended = why
 
-    def _begin(self, prepared: PreparedDrive | PreparedBody) -> None:
+    def _begin(self, prepared: Prepared) -> None:
         """Begin anew what was stopped; where that fails the node is not active any more."""
         try:
             self._activity = prepared.begin()
@@ -181,7 +180,7 @@ class _Node:
         response.success, response.message = True, "reset"
         return response
 
-    def _load(self, request: Any) -> tuple[Any, Callable[[], None]]:
+    def _load(self, request: Any) -> tuple[Prepared, Prepared]:
         """Read another map and compile for it, beside the drive: a wrong one does not stop it."""
         prepared = self._prepared
         if prepared is None:
@@ -190,14 +189,15 @@ class _Node:
 
     def _take_markers(self, request: Any, response: Any, loaded: Any) -> Any:
         """Take the map that was loaded, and begin anew in it."""
-        prepared: PreparedDrive | PreparedBody = loaded[0]
-        if prepared is not self._prepared:
+        before, after = loaded
+        if before is not self._prepared:
             raise BadInput("load_markers", "the node was configured anew meanwhile")
         active = self._activity is not None
         self._stop("another map")
-        loaded[1]()
+        self._prepared = after
+        after.show_map()
         if active:
-            self._begin(prepared)
+            self._begin(after)
         response.success, response.message = True, "another map"
         return response
 
@@ -226,11 +226,11 @@ def _lifecycle_node(owner: _Node, name: str, context: Any) -> Any:
     from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
     def step(transition: str) -> Callable[[Any, Any], Any]:
-        def took(self: Any, state: Any) -> Any:
-            good = owner.took(transition)
+        def change_state(self: Any, state: Any) -> Any:
+            good = owner.change_state(transition)
             return TransitionCallbackReturn.SUCCESS if good else TransitionCallbackReturn.FAILURE
 
-        return took
+        return change_state
 
     steps = ("configure", "activate", "deactivate", "cleanup", "shutdown")
     kind = type("JaxnavNode", (LifecycleNode,), {f"on_{one}": step(one) for one in steps})

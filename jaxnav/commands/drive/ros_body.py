@@ -2,37 +2,21 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
-from jaxnav.commands.drive.arguments import Ros
-from jaxnav.commands.drive.ros_setup import (
-    Activity,
-    Say,
-    check_selector,
-    odom_for,
-    path_of,
-    publisher_for,
-    rig_for,
-    timed,
-)
+from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared, path_of
 from jaxnav.commands.drive.run import searches_for
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.selectors import make_selector
-from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import OdometryErrors
-from jaxnav.core.navigator import Navigator, Step
+from jaxnav.core.navigator import Navigator
 from jaxnav.drive.compiled_step import compiled_step
 from jaxnav.drive.interfaces import Camera, Setup
 from jaxnav.drive.pilot import Outcome
 from jaxnav.drive.seeing import Search
-from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput
-from jaxnav.files import Params, apply_params, load_markers, load_params
+from jaxnav.files import apply_params, load_markers, load_params
 from jaxnav.files.configuration import step_folder
-from jaxnav.files.ros import RosFile
 from jaxnav.recordings.ros.body import BodyTracker
 from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
 from jaxnav.recordings.ros.odometry_track import GrowingTrack
@@ -40,58 +24,13 @@ from jaxnav.vehicles.ros.connection import Connection
 from jaxnav.vehicles.ros.odom_frame import pose_of
 from jaxnav.vehicles.ros2_cameras import open_cameras
 
-_LOOK_S = 0.05
 
-
-class PreparedBody:
-    """A rig that moves freely, with its files read and its step compiled.
-
-    Attributes:
-        file: the node's.
-    """
-
-    def __init__(
-        self, args: Ros, file: RosFile, connection: Connection, signals: Signals, say: Say
-    ):
-        """Read and compile.
-
-        Raises:
-            BadInput: a file is wrong; names file and key.
-        """
-        self.file = file
-        check_selector(file)
-        for flag, given in (("--record", args.record), ("--bag", args.bag)):
-            if given is not None:
-                raise BadInput(flag, "is for drives: the file names no vehicle")
-        self._args, self._say, self._connection = args, say, connection
-        rig, markers = rig_for(file, signals), load_markers(path_of(file, "markers"))
-        connection.ros_time = True  # the same stamps give the same poses, whenever they come
-        self._navigator, self._step, self._searches = self._compiled(file, rig, markers)
-        odom, listening = odom_for(file, connection)
-        self._leave = partial(connection.forget, *listening)
-        self._publisher = publisher_for(file, connection, markers, odom)
-        nothing: Any = None
-        options = file.options(False, connection.sim_time) | {"stamps": "ros"}
-        self._setup = Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
-
-    def with_markers(self, path: str) -> Callable[[], None]:
-        """See `PreparedDrive`."""
-        file, rig = self.file.with_markers(path), self._navigator.rig
-        markers = load_markers(path_of(file, "markers"))
-        compiled, setup = self._compiled(file, rig, markers), replace(self._setup, markers=markers)
-
-        def take() -> None:
-            self.file, self._setup = file, setup
-            self._navigator, self._step, self._searches = compiled
-            self._publisher.show_map(markers)
-
-        return take
+class PreparedBody(Prepared):
+    """A rig that moves freely."""
 
     def begin(self) -> Activity:
-        """Begin to track it, with nothing known."""
-        tracker = self._tracker(self._navigator, self._step, self._publisher.publish)
-        ends: list[Any] = []
-        if self.file.odometry is not None:
+        tracker, ends = self._tracker(self.publisher.publish), list[Any]()
+        if self._file.odometry is not None:
             clock = self._connection.source_clock()
 
             def take(message: Any) -> None:
@@ -99,51 +38,45 @@ class PreparedBody:
                 if pose is not None:
                     tracker.add_odometry(clock.time_ns(message.header.stamp), pose)
 
-            ends.append(self._connection.listen(NAV_ODOMETRY, self.file.odometry, take))
+            ends.append(self._connection.listen(NAV_ODOMETRY, self._file.odometry, take))
         cameras = open_cameras(self._setup, None)
         return _Tracking(tracker, cameras, self._searches, self._connection, ends)
 
-    def close(self) -> None:
-        """Leave the topics."""
-        self._publisher.close()
-        self._leave()
+    def _read(self) -> Setup:
+        for flag, given in (("--record", self._args.record), ("--bag", self._args.bag)):
+            if given is not None:
+                raise BadInput(flag, "is for drives: the file names no vehicle")
+        rig, markers = self._rig(), load_markers(path_of(self._file, "markers"))
+        self._connection.ros_time = True  # the same stamps give the same poses, whenever they come
+        nothing: Any = None
+        options = self._file.options(False, self._connection.sim_time) | {"stamps": "ros"}
+        return Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
 
-    def _compiled(
-        self, file: RosFile, rig: CameraRig, markers: MarkerMap
-    ) -> tuple[Navigator, Step, list[Search]]:
-        """The navigator, its compiled step, and the searches, all of them warm."""
+    def _compile(self) -> None:
+        file, setup, odometry_errors = self._file, self._setup, None
+        if file.odometry is not None:
+            sigma = file.odometry_sigma.sigma()
+            odometry_errors = OdometryErrors.create(sigma, file.T_vehicle_sensor[4:])
         navigator = Navigator(
-            rig=rig,
-            markers=markers,
+            rig=setup.rig,
+            markers=setup.markers,
             selector=make_selector(file.selector),
-            motion=ConstantVelocity(odometry_errors=_errors(file)),
+            motion=ConstantVelocity(odometry_errors=odometry_errors),
             corner_sigma_px=file.corner_sigma_px,
         )
-        params = file.file("params")
-        params_read = Params.of({}, "") if params is None else load_params(params)
-        navigator = apply_params(navigator, params_read)
-        step = compiled_step(navigator, step_folder())
-        searches = searches_for(self._args.corner_backend, rig, markers)
-        tracker = self._tracker(navigator, step, lambda outcome: None)
-        others = [search.warm_up for search in searches]
-        timed(self._say, lambda: [warm_up() for warm_up in (tracker.warm_up, *others)])
-        return navigator, step, searches
+        if (params := file.file("params")) is not None:
+            navigator = apply_params(navigator, load_params(params))
+        self._navigator, self._step = navigator, compiled_step(navigator, step_folder())
+        self._searches = searches_for(self._args.corner_backend, setup.rig, setup.markers)
+        warm_ups = self._tracker(lambda outcome: None).warm_up, *(s.warm_up for s in self._searches)
+        self._timed(lambda: [warm_up() for warm_up in warm_ups])
 
-    def _tracker(
-        self, navigator: Navigator, step: Step, publish: Callable[[Outcome], None]
-    ) -> BodyTracker:
-        file, contained = self.file, self._connection.contained
-        track = None
+    def _tracker(self, publish: Callable[[Outcome], None]) -> BodyTracker:
+        file, contained, track = self._file, self._connection.contained, None
         if file.odometry is not None:
             track = GrowingTrack(file.T_vehicle_sensor, file.odometry_delay_s)
-        return BodyTracker(navigator, step, len(file.cameras), publish, track, contained)
-
-
-def _errors(file: RosFile) -> OdometryErrors | None:
-    """The errors that the filter keeps of the odometry; None without one."""
-    if file.odometry is None:
-        return None
-    return OdometryErrors.create(file.odometry_sigma.sigma(), file.T_vehicle_sensor[4:])
+        cameras = len(file.cameras)
+        return BodyTracker(self._navigator, self._step, cameras, publish, track, contained)
 
 
 class _Tracking:
@@ -194,11 +127,11 @@ class _Tracking:
             turn(index)
 
     def _turn(self, index: int) -> None:
-        frame = self._cameras[index].read(_LOOK_S)
+        frame = self._cameras[index].read(LOOK_S)
         if frame is not None:
             sighted = self._searches[index].look(frame, None)
             if sighted.detections is not None:
                 self._tracker.add(index, sighted.stamp_ns, sighted.detections)
 
     def _rest(self, problem: str, index: int) -> None:
-        self._over.wait(_LOOK_S)
+        self._over.wait(LOOK_S)

@@ -19,12 +19,20 @@ import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
 from jaxnav.commands.drive.delay_watch import DelayWatch
-from jaxnav.commands.drive.learnt_watch import ExposureWatch
-from jaxnav.commands.drive.observers import closing_notes, open_onlookers
+from jaxnav.commands.drive.observers import (
+    DriveObserver,
+    DriveRecorder,
+    ExposureWatch,
+    LearntWatch,
+    LiveView,
+    closing_notes,
+)
+from jaxnav.commands.drive.status_line import StatusLine
 from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import Vehicle
 from jaxnav.detection import Tracker, make_detectors
 from jaxnav.drive import plugins
 from jaxnav.drive.corrections import Corrections
@@ -37,7 +45,7 @@ from jaxnav.drive.pilot import Pilot
 from jaxnav.drive.priority import before_others
 from jaxnav.drive.seeing import Eyes, Search
 from jaxnav.drive.signals import EXIT_STOPPED, Signals
-from jaxnav.errors import BadInput, visible
+from jaxnav.errors import BadInput, Containment, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.files.configuration import step_folder
 from jaxnav.files.executables import keep_in
@@ -80,27 +88,29 @@ def run(args: Run, signals: Signals) -> int:
         if guarding is not None:
             closing.callback(guarding.end)
             guarding.prepare(signals.check)  # its errors are reported before anything is compiled
+        plugins.try_cameras(args.cameras or args.car, vehicle_setup)  # so are these
+        signals.check()
         follow = args.detector == "follow"
         searches = searches_for(args.corner_backend, setup.rig, setup.markers, follow)
-        onlookers = open_onlookers(args, setup, closing)
-        onlookers.append(ExposureWatch(setup.rig.names, searches))
-        for onlooker in onlookers:
-            signals.before_leaving(onlooker.close)
+        observers = open_observers(args, setup, closing)
+        observers.append(ExposureWatch(setup.rig.names, searches))
+        for observer in observers:
+            signals.before_leaving(observer.close)
         signals.check()
         others = [search.warm_up for search in searches]
-        others += [one.warm_up for one in onlookers if isinstance(one, DelayWatch)]
+        others += [one.warm_up for one in observers if isinstance(one, DelayWatch)]
         pilot = compiled_pilot(args, setup, others)
         signals.check()
         resumes = args.vehicle is not None and may_resume(args.vehicle)
         drive = Drive(args, vehicle_setup, guarding, signals, resumes=resumes)
         try:
-            reason = drive.run(pilot, searches, onlookers)
+            reason = drive.run(pilot, searches, observers)
         finally:  # also of a drive that raises
             if drive.heard is not None:
                 _warn(drive.heard)
     _summarise(drive.loop, drive.eyes, reason)
     print(f"guard: {drive.kept_by}")
-    for note in closing_notes(onlookers, drive.loop.contained):
+    for note in closing_notes(observers, drive.loop.contained):
         print(note)
     return EXIT_STOPPED if drive.loop.stopped or drive.heard is not None else 0
 
@@ -127,6 +137,36 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
         float64=args.float64,
         relocate=args.relocate,
     )
+
+
+def open_observers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[DriveObserver]:
+    """Open the observers that the arguments ask for.
+
+    Args:
+        closing: closes them in the end.
+
+    Raises:
+        BadInput: the file can't be written, Rerun is missing or its window does not open.
+    """
+    observers: list[DriveObserver] = []
+
+    def add(observer: DriveObserver) -> None:
+        closing.callback(Containment().of(f"{type(observer).__name__}.close", observer.close))
+        observers.append(observer)
+
+    if args.record is not None:
+        add(DriveRecorder(args.record, setup, args.record_images))
+    if args.view:
+        from jaxnav.pictures.rerun.view import RerunView  # imports all that draws
+
+        waypoints_m = np.asarray(setup.route_on_map.waypoints_m, float)
+        add(LiveView(RerunView(setup.rig, setup.markers, waypoints_m, live=True, save=None)))
+    if isinstance(setup.vehicle, Vehicle):  # it knows the motion of a car alone
+        add(DelayWatch(setup, warns=not args.headless))
+    add(LearntWatch(setup, tells=not args.headless))
+    if not args.headless:
+        add(StatusLine())
+    return observers
 
 
 def guarding_process(args: Run) -> GuardProcess | None:
@@ -222,7 +262,7 @@ class Drive:
         self._args, self._setup, self._guarding, self._signals = args, setup, guarding, signals
         self._until_arrival, self._now_ns = until_arrival, now_ns
 
-    def run(self, pilot: Pilot, searches: list[Search], onlookers: Sequence[Observer]) -> str:
+    def run(self, pilot: Pilot, searches: list[Search], observers: Sequence[Observer]) -> str:
         """Open, drive, stop and close; return why the drive ended."""
         args, signals = self._args, self._signals
         with ExitStack() as closing:
@@ -244,7 +284,7 @@ class Drive:
             # The guard trips before the eyes are closed, which their threads may delay.
             closing.callback(guard.trip, "the drive is over")
             self.loop = Loop(
-                pilot, guard, vehicle, self.eyes, onlookers, args.period_s, self._now_ns, _warn
+                pilot, guard, vehicle, self.eyes, observers, args.period_s, self._now_ns, _warn
             )
             signals.check()
             duration_s = args.duration_s if args.duration_s is not None else float("inf")

@@ -20,6 +20,7 @@ from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.files import calib_dir, save_vehicle, write_params
 from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle
@@ -480,6 +481,10 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
             "base.yaml: base omni needs left_limit_mps",
         ),
         (["--record-images"], "--record-images: needs --record"),
+        (
+            ["--cameras", "opencv", "--option", "source.front=/dev/nowhere"],
+            "--option source.front: there is no device or file /dev/nowhere",
+        ),
         (["--period-s", "5"], "--period-s: must be at most 0.1, got 5.0"),
     ],
 )
@@ -490,9 +495,11 @@ def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys
     text = Path("base.yaml").read_text()
     Path("base.yaml").write_text(text.replace("differential", "omni"))
     monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda **_: None)
+    monkeypatch.setattr(DriveSetup, "pilot", lambda *_: pytest.fail("compiles"))
     vehicle = [] if "--car" in arguments else ["--car", recorded_vehicle.NAME]
     log = tmp_path / "told"
-    options = [*vehicle, "--cameras", "sim", "--option", f"log={log}", "--headless"]
+    cameras = [] if "--cameras" in arguments else ["--cameras", "sim"]
+    options = [*vehicle, *cameras, "--option", f"log={log}", "--headless"]
     assert main(["run", *options, *arguments]) == EXIT_BAD_INPUT
     out, err = capsys.readouterr()
     assert (out, err.count("\n")) == ("", 1)

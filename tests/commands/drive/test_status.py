@@ -1,4 +1,4 @@
-"""The status line of a drive keeps its width and its columns."""
+"""The status line of a drive keeps its width and its columns; notices are said once."""
 
 import dataclasses
 import math
@@ -8,7 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnav.commands.drive.observers import WIDTH, notice, status_line
+from jaxnav.commands.drive.observers import WIDTH
+from jaxnav.commands.drive.status_line import notice, status_line
 from jaxnav.drive.flags import Fault, Health
 from tests.helpers.drives import make_outcome
 
@@ -83,3 +84,22 @@ def test_what_begins_is_told_once():
     for fault in (Fault.WAYS_DISPUTED, Fault.ODOMETRY_DOUBTFUL):
         assert notice(dataclasses.replace(outcome, faults=fault), Fault(0))
     assert notice(dataclasses.replace(outcome, faults=Fault.CAMERA_STALE), Fault(0)) is None
+
+
+@given(st.tuples(*[st.floats() | st.floats(-9, 9)] * 3))
+def test_the_status_line_of_a_base_has_its_twist_and_always_one_width(twist):
+    outcome = dataclasses.replace(make_outcome(1), twist=(0.25, -0.5, math.radians(-90)))
+    line = status_line(outcome, 30.0, 4.0, True)
+    assert line.endswith("go  0.25 -0.50  -90.0")
+    other = dataclasses.replace(outcome, twist=twist)
+    assert len(status_line(other, 30.0, 4.0, True)) == len(line) <= WIDTH
+
+
+def test_a_gyro_that_begins_to_fail_is_named_once():
+    invalid = dataclasses.replace(make_outcome(1), faults=Fault.GYRO_INVALID)
+    assert "the gyro's readings are not finite" in notice(invalid, Fault(0))
+    assert notice(invalid, Fault.GYRO_INVALID) is None
+    stale = dataclasses.replace(invalid, faults=Fault.GYRO_STALE)
+    assert notice(stale, Fault(0)) == "the gyro tells nothing: the drive goes on without it"
+    silent = dataclasses.replace(stale, faults=Fault.GYRO_STALE | Fault.ODOMETRY_STALE)
+    assert notice(silent, Fault(0)) is None  # the whole vehicle tells nothing

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxnav.cli import main
-from jaxnav.commands.drive.observers import WIDTH, status_line
+from jaxnav.commands.drive.observers import WIDTH
+from jaxnav.commands.drive.status_line import status_line
 from jaxnav.commands.process import configure_jax
 from jaxnav.core.models.origin import (
     GRID_M,

@@ -1,17 +1,22 @@
-"""What the service `~/save` of the node writes: the files that `calibrate adopt` makes of the same
-drive's recording."""
+"""The node of ROS 2 without ROS: what its file may ask for, and what its service `~/save` writes.
+
+Those are the files that `calibrate adopt` makes of the same drive's recording.
+"""
 
 import dataclasses
 
 import pytest
 import yaml
 
-from jaxnav.commands.drive.ros_save import LearntKeeper
+from jaxnav.commands.drive.ros_drive import LearntKeeper, check_vehicle
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig, load_vehicle, save_rig, save_vehicle
 from jaxnav.files.ros import load_ros
 from jaxnav.recordings.drive_setup import DriveSetup
+from tests import worlds
 from tests.commands.calibrate.test_adopt import adopt, learnt_outcome, record, setup_of
 from tests.helpers import late
 
@@ -23,6 +28,7 @@ markers: markers.yaml
 cameras: {front: /front/detections}
 odometry: /odom
 """
+IMU = "imu: {topic: /imu, T_vehicle_imu: {wxyz: [0, 1, 0, 0], xyz_m: [0, 0, 0]}}\n"
 
 
 def content(path):
@@ -125,3 +131,48 @@ def test_a_file_that_was_changed_since_is_not_corrected(folder, name):
     with pytest.raises(BadInput, match=f"{name}.yaml: has other"):
         keeper.save("new")
     assert not list((folder / "new").iterdir())
+
+
+def node(tmp_path, text):
+    path = tmp_path / "node.yaml"
+    path.write_text(NODE + text)
+    return load_ros(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (
+            "odometry_type: ackermann_msgs/msg/AckermannDriveStamped\n",
+            "odometry_type: of a base that is no car must be one of nav_msgs/msg/Odometry, ",
+        ),
+        ("command_type: ackermann\n", "command_type: of a base that is no car must be twist"),
+        ("base_x_m: 0.1\n", "base_x_m: of a base that is no car must be 0"),
+        (IMU, "imu: vehicle.yaml has no gyro"),
+    ],
+)
+def test_a_node_refuses_what_does_not_go_with_its_vehicle(tmp_path, text, line):
+    with pytest.raises(BadInput) as caught:
+        check_vehicle(node(tmp_path, text), TwistBase.create(1.0, 3.0, 0.1))
+    assert str(caught.value).startswith(f"{tmp_path / 'node.yaml'}: {line}")
+
+
+def test_a_node_tells_its_plug_in_what_the_file_says(tmp_path):
+    file = node(tmp_path, IMU + "command_type: twist\n")
+    check_vehicle(file, TwistBase.create(1.0, 3.0, 0.1, gyro=GYROS["consumer"]))
+    check_vehicle(node(tmp_path, ""), worlds.qcar())
+    options = file.options(drives=True, sim_time=False)
+    assert (options["imu_topic"], options["command_type"]) == ("/imu", "twist")
+    axis = [float(part) for part in options["imu_axis"].split(",")]
+    assert axis == pytest.approx([0.0, 0.0, -1.0], abs=1e-12)  # mounted upside down
+    assert "command_topic" not in options
+    assert file.options(drives=False, sim_time=False)["command_type"] == "none"
+    # Left out, the plug-in knows by the vehicle what is sent.
+    assert "command_type" not in node(tmp_path, "").options(drives=True, sim_time=False)
+
+
+def test_an_imu_needs_a_vehicle(tmp_path):
+    path = tmp_path / "node.yaml"
+    path.write_text(NODE.replace("vehicle: vehicle.yaml\n", "") + IMU)
+    with pytest.raises(BadInput, match="imu needs a vehicle"):
+        load_ros(path)
