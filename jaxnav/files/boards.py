@@ -18,14 +18,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import Field
 
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Count, Entry, ForeignEntry, Positive, Size, Text, at, validate
-from jaxnav.files.writing import atomic_write
+from jaxnav.files.writing import atomic_write, yaml_text
 
 Spacing = Annotated[Positive, within("spacing")]
 Squares = Annotated[int, Field(strict=True, ge=1, le=100)]
@@ -154,7 +153,7 @@ def save_board(path: str | Path, figures: Mapping[str, Any]) -> None:
         Path(path),
         {key: figures[field.serialization_alias or key] for key, field in fields.items()},
     )
-    atomic_write(path, yaml.safe_dump(entry.model_dump(), sort_keys=False))
+    atomic_write(path, yaml_text(entry.model_dump()))
 
 
 def _own(path: Path, data: dict[str, Any]) -> BoardFile:

@@ -32,7 +32,6 @@ from jaxnav.core.parameters import TUNABLES
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import written_pose
 from jaxnav.files.validation import (
     CornerSigma,
     Entry,
@@ -139,7 +138,7 @@ class ImuEntry(Entry):
 
     def T_matrix(self) -> Float[np.ndarray, "4 4"]:
         """T_vehicle_imu, (4, 4)."""
-        return poses.matrix(poses.pose_as_read(written_pose(self.T_vehicle_imu)))
+        return poses.matrix(poses.pose_as_read(self.T_vehicle_imu))
 
 
 class TopicMap(Entry):

@@ -26,7 +26,7 @@ from jaxnav.core.pose.refine import Candidates
 from jaxnav.detection import ArucoDetector, Detections, Detector, make_detector
 from jaxnav.detection.acquire import acquire_in_photograph
 from jaxnav.errors import BadInput
-from jaxnav.files.cameras import load_figures
+from jaxnav.files.cameras import load_camera_entry
 from jaxnav.files.images import read_photograph
 from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 
@@ -41,8 +41,9 @@ def run(args: Locate) -> int:
         raise BadInput("--out", f"must end in .png or .jpg, got {args.out}")
     configure_jax(float64=True)
     detectors = detectors_for(args.corner_backend, args.family)
-    figures = load_figures(args.camera, args.camera_name)
-    camera, size_px, lens_sigma_px = figures.camera(), figures.image_size_px, figures.lens_sigma_px
+    entry = load_camera_entry(args.camera, args.camera_name)
+    camera, size_px = entry.camera(), (entry.image_size_px[0], entry.image_size_px[1])
+    lens_sigma_px = entry.sigma.lens_px() if entry.sigma else None
     image, orientation = read_photograph(args.image)
     height, width = image.shape[:2]
     if (width, height) != size_px:

@@ -12,8 +12,7 @@ from jaxnav.commands.calibrate.arguments import CalibrateConvert
 from jaxnav.commands.kinds import check_values
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures
-from jaxnav.files.rigs import rig_text
+from jaxnav.files.rigs import CameraEntry, rig_text
 from tests.helpers.conversions import (
     KALIBR,
     PHOTONVISION,
@@ -25,10 +24,15 @@ from tests.helpers.conversions import (
 )
 
 
-def camera(lens: str, distortion: list[float] | None = None, name: str = "front") -> CameraFigures:
+def camera(lens: str, distortion: list[float] | None = None, name: str = "front") -> CameraEntry:
     count = LENS_COEFFICIENTS[lens]
-    return CameraFigures.create(
-        name, lens, [400.0, 401.0, 320.0, 240.0], distortion or [0.0] * count, (640, 480), np.eye(4)
+    return CameraEntry.create(
+        name,
+        lens,
+        [400.0, 401.0, 320.0, 240.0],
+        distortion or [0.0] * count,
+        (640, 480),
+        T_camera_vehicle=np.eye(4).tolist(),
     )
 
 
