@@ -28,7 +28,10 @@ def read_npz(
         BadInput: it is no regular file, or can't be opened.
         Exception: any that the bytes lead to in NumPy, zipfile, zlib and here.
     """
-    with open_file(path) as file, zipfile.ZipFile(cast(IO[bytes], _Bounded(file))) as archive:
+    with open_file(path) as file:
+        if file.read(6) == np.lib.format.MAGIC_PREFIX:
+            raise ValueError("it holds a single array")
+        archive = zipfile.ZipFile(cast(IO[bytes], _Bounded(file)))
         members = [(info.filename.removesuffix(".npy"), info) for info in archive.infolist()]
         wanted = [(key, info) for key, info in members if keys is None or key in keys]
         if len(dict(wanted)) < len(wanted):

@@ -47,7 +47,7 @@ _SYMMETRY = 1e-6  # relative to the geometric mean of the two variances: what fl
 
 
 class ParamsFile(Entry):
-    """A file of tuned parameters, whose values `Params.of` checks."""
+    """A file of tuned parameters, whose values `Params.from_values` checks."""
 
     parameters: Annotated[dict[str, Any], Field(min_length=1)]
     provenance: dict[str, Any] = Field(default_factory=dict)
@@ -70,7 +70,7 @@ class Params:
     prefix: str = field(default="", kw_only=True)
 
     @staticmethod
-    def of(
+    def from_values(
         values: Mapping[str, Any],
         path: str | Path,
         provenance: Mapping[str, Any] | None = None,
@@ -105,7 +105,7 @@ class Params:
         return replace(self, values=values)
 
     def plain(self) -> dict[str, Any]:
-        """The values as numbers and nested lists, bit for bit, of which `of` makes the same."""
+        """The values as plain numbers and lists, bit for bit: `from_values` makes the same."""
         return {name: value.tolist() for name, value in self.values.items()}
 
     def describe(self) -> str:
@@ -128,7 +128,7 @@ def load_params(path: str | Path) -> Params:
         BadInput: one line naming file and key.
     """
     entry = read(path, ParamsFile)
-    return Params.of(entry.parameters, path, entry.provenance)
+    return Params.from_values(entry.parameters, path, entry.provenance)
 
 
 def write_params(
@@ -148,7 +148,7 @@ def write_params(
     path = Path(path)
     if path.suffix.lower() == ".json":
         raise BadInput(path, "must not be called .json: it is written as YAML")
-    params = Params.of(values, path, plain_data(dict(provenance or {})))
+    params = Params.from_values(values, path, plain_data(dict(provenance or {})))
     plain = params.plain()
     validate(ParamsFile, {"parameters": plain}, path)
     text = "parameters:\n"

@@ -27,7 +27,7 @@ class Budget:
     left: int
 
     @staticmethod
-    def of_file(path: Path) -> "Budget":
+    def from_file(path: Path) -> "Budget":
         """The budget by a file's size; a file that compresses far better is no recording."""
         packed = 0
         with suppress(OSError):

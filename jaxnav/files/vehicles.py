@@ -90,8 +90,8 @@ class VehicleFile(Entry):
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
         figures = self.model_dump(exclude={*_NO_FIGURES}, exclude_none=True)
-        told = zip(SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA, strict=True)
-        sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
+        defaults = zip(SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA, strict=True)
+        sigma = np.asarray([self.sigma.get(name, default) for name, default in defaults])
         gyro = None if self.gyro is None else self.gyro.gyro()
         return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None, gyro=gyro)
 

@@ -63,7 +63,7 @@ def temporary_file(target: Path, mode: int) -> Path:
     Raises:
         OSError: it can't be made.
     """
-    for left in target.parent.glob(".jaxnav-*"):
+    for left in target.parent.glob(f".jaxnav-{16 * '[0-9a-f]'}*"):
         with suppress(OSError):
             if left.is_file() and time.time() - left.lstat().st_mtime > _LEFT_S:
                 left.unlink()

@@ -90,7 +90,7 @@ def test_numbers_come_back_bit_for_bit_and_reach_the_navigator(kind, tmp_path):
         params = load_params(path)
         assert bits(params.values) == bits(values)
         assert list(params.values) == [name for name in TUNABLES if name in values]
-        again = Params.of(json.loads(json.dumps(params.plain())), path)
+        again = Params.from_values(json.loads(json.dumps(params.plain())), path)
         assert bits(again.values) == bits(values)
         changed = parameters_of(apply_params(navigator, params))
         assert bits(changed) == before | bits(values)
@@ -158,7 +158,7 @@ def test_a_gate_may_be_none_and_stays_none(tmp_path):
     values = {"motion.gate_nis": 30, "model_sigma_px": 0.2}
     for selector, gate_nis in ((PaperCost(), 30), (Ungated(PaperCost()), np.inf)):
         navigator = apply_params(
-            Navigator(RIG, MARKERS, QCAR, selector=selector), Params.of(values, WHERE)
+            Navigator(RIG, MARKERS, QCAR, selector=selector), Params.from_values(values, WHERE)
         )
         assert float(navigator.motion.gate_nis) == gate_nis
         assert float(navigator.model_sigma_px) == 0.2
@@ -316,11 +316,11 @@ def test_what_float32_leaves_of_a_symmetric_matrix_is_one(tmp_path):
 
 def test_one_file_serves_every_selector_and_what_is_not_driven():
     values = {"controller.lookahead_m": 2.0, "selector.floor_m": 1e-3, "model_sigma_px": 0.2}
-    params = Params.of(values, WHERE)
+    params = Params.from_values(values, WHERE)
     paper = Navigator(RIG, MARKERS, QCAR, worlds.WAYPOINTS_M, selector=PaperCost())
     exact = Navigator(worlds.qcar_rig(), MARKERS, worlds.qcar())
     priors = {"motion.vehicle.sensor_sigma": [0.1] * 4, "rig.extrinsics_sigma": [[0.1] * 6] * 4}
-    assert parameters_of(apply_params(exact, Params.of(priors, WHERE))).keys() == (
+    assert parameters_of(apply_params(exact, Params.from_values(priors, WHERE))).keys() == (
         parameters_of(exact).keys()
     )
     for navigator, taken in [
@@ -378,6 +378,6 @@ def test_one_file_serves_every_selector_and_what_is_not_driven():
     ],
 )
 def test_what_does_not_fit_is_named_with_its_key(kind, values, line):
-    params = Params.of(values, WHERE)
+    params = Params.from_values(values, WHERE)
     found = problem(apply_params, NAVIGATORS[kind], params)
     assert found.startswith(f"p.yaml: parameters.{line}")

@@ -118,7 +118,7 @@ def test_a_large_file_is_not_read(folder, monkeypatch):
 
 
 def test_what_a_killed_process_has_left_is_removed_and_a_living_one_keeps_its_own(folder):
-    left, living = folder / ".jaxnav-1.step", folder / ".jaxnav-2.step"
+    left, living = (folder / f".jaxnav-{16 * digit}.step" for digit in "ab")
     for path in (left, living):
         path.write_bytes(b"half")
     os.utime(left, (0, 0))

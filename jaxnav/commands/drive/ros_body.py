@@ -120,7 +120,7 @@ class PreparedBody:
             corner_sigma_px=file.corner_sigma_px,
         )
         params = file.file("params")
-        params_read = Params.of({}, "") if params is None else load_params(params)
+        params_read = Params.from_values({}, "") if params is None else load_params(params)
         navigator = apply_params(navigator, params_read)
         step = compiled_step(navigator, step_folder())
         searches = searches_for(self._args.corner_backend, rig, markers)

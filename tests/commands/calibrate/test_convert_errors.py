@@ -152,7 +152,7 @@ def test_a_camera_without_lens_is_written_with_zeros(tmp_path, capsys):
         out = convert(source, to, tmp_path / to)
         assert "that front is without lens: written as zeros" in capsys.readouterr().out
         (path,) = out.iterdir()
-        assert cameras_in(path)[0].distortion == (0.0,) * 5
+        assert cameras_in(path)[0].distortion == [0.0] * 5
 
 
 def test_the_command_line_reaches_it(tmp_path, capsys):
