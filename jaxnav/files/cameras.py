@@ -68,7 +68,7 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
             several cameras.
     """
     entry = load_camera_entry(Path(path), name)
-    return entry.camera(), (entry.image_size_px[0], entry.image_size_px[1])
+    return entry.camera(), entry.size_px
 
 
 def load_camera_entry(path: Path, name: str | None) -> CameraEntry:

@@ -225,6 +225,12 @@ class CameraEntry(Entry):
         return Camera.create(self.focal_px, self.center_px, self.lens, self.distortion)
 
     @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of its images."""
+        width, height = self.image_size_px
+        return width, height
+
+    @property
     def timing(self) -> Timing:
         """When its sensor sees."""
         return Timing(self.exposure_s, self.row_time_s)
@@ -270,7 +276,7 @@ def rig_of(cameras: Sequence[CameraEntry]) -> CameraRig:
         [camera.camera() for camera in cameras],
         [jaxlie.SE3(jnp.asarray(T, float)) for T in Ts],
         [camera.name for camera in cameras],
-        [(camera.image_size_px[0], camera.image_size_px[1]) for camera in cameras],
+        [camera.size_px for camera in cameras],
         # Degrees and radians give back the same numbers where these are float32's.
         np.asarray(sigmas, np.float32).astype(float) if sigmas.any() else None,
         timings if any(timing != UNKNOWN_TIMING for timing in timings) else None,

@@ -42,7 +42,7 @@ def run(args: Locate) -> int:
     configure_jax(float64=True)
     detectors = detectors_for(args.corner_backend, args.family)
     entry = load_camera_entry(args.camera, args.camera_name)
-    camera, size_px = entry.camera(), (entry.image_size_px[0], entry.image_size_px[1])
+    camera, size_px = entry.camera(), entry.size_px
     lens_sigma_px = entry.sigma.lens_px() if entry.sigma else None
     image, orientation = read_photograph(args.image)
     height, width = image.shape[:2]
