@@ -177,7 +177,9 @@ def is_base_file(data: Mapping[str, Any]) -> bool:
 
 def _read(path: Path) -> VehicleFile | BaseFile:
     data = read_mapping(path)
-    return validate(BaseFile if is_base_file(data) else VehicleFile, data, path)
+    if is_base_file(data):
+        return validate(BaseFile, data, path)
+    return validate(VehicleFile, data, path)
 
 
 def load_car(path: str | Path) -> Vehicle:

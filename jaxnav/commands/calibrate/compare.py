@@ -23,7 +23,7 @@ def run(args: CalibrateCompare) -> int:
     pairs = _pairs(args)
     folder = output_folder(args.out)
     maps = {
-        name: projection_difference(one.camera(), other.camera(), one.image_size_px)
+        name: projection_difference(one.camera(), other.camera(), one.size_px)
         for name, (one, other) in pairs.items()
     }
     cameras = {name: _report(*pairs[name], maps[name]) for name in pairs}
