@@ -534,7 +534,7 @@ def test_a_camchain_is_chained(tmp_path):
         (
             "camera_model: pinhole",
             "camera_model: fov",
-            "cam0.camera_model: must be 'pinhole', 'omni', 'ds' or 'eucm', got 'fov'",
+            "cam0.camera_model: must be 'pinhole', 'omni', 'ds' or 'eucm', got the text 'fov'",
         ),
         ("0.001, 0.002]", "0]", "cam1.distortion_coeffs: must have 4 or 5 numbers, got 3"),
         ("T_cam_imu", "T_imu", "cam0.T_cam_imu: missing"),
