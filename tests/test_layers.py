@@ -205,7 +205,7 @@ def test_forbidden_arrows_are_caught() -> None:
     ("module", "source"),
     [
         ("core.navigator", "from jaxnav.core.pose import ippe\nimport jax.numpy as jnp"),
-        ("recordings.other.replay", "from jaxnav.files.rigs import load_rig"),
+        ("recordings.other.replay", "from jaxnav.files.cameras import load_rig"),
         ("experiments.grid", "from jaxnav.sim import rollout\nimport xarray"),
         ("files.rigs", "from .reading import read\nfrom jaxnav.errors import BadInput"),
         ("commands.simulate.demo", "from jaxnav import pictures"),

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 from jaxnav.errors import BadInput
 
 if TYPE_CHECKING:
-    from jaxnav.files.cameras import load_camera
+    from jaxnav.files.cameras import load_camera, load_rig
     from jaxnav.files.markers import load_markers, save_markers
     from jaxnav.files.params import Params, apply_params, load_params, write_params
-    from jaxnav.files.rigs import load_rig, save_rig
+    from jaxnav.files.rigs import save_rig
     from jaxnav.files.topics import TopicMap, load_topics
     from jaxnav.files.vehicles import Route, load_car, load_route, load_vehicle, save_vehicle
     from jaxnav.files.writing import (
@@ -54,10 +54,10 @@ __all__ = [
 ]
 
 _MODULES = {
-    "cameras": ("load_camera",),
+    "cameras": ("load_camera", "load_rig"),
     "markers": ("load_markers", "save_markers"),
     "params": ("Params", "apply_params", "load_params", "write_params"),
-    "rigs": ("load_rig", "save_rig"),
+    "rigs": ("save_rig",),
     "topics": ("TopicMap", "load_topics"),
     "vehicles": ("Route", "load_car", "load_route", "load_vehicle", "save_vehicle"),
     "writing": ("atomic_path", "atomic_write", "output_folder", "write_json", "write_tum"),

@@ -82,8 +82,8 @@ class BaseFile(Entry):
 
     def vehicle(self) -> TwistBase:
         """The base, in the process's precision."""
-        told = zip(TWIST_ERRORS, DEFAULT_TWIST_SIGMA, strict=True)
-        sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
+        defaults = zip(TWIST_ERRORS, DEFAULT_TWIST_SIGMA, strict=True)
+        sigma = np.asarray([self.sigma.get(name, default) for name, default in defaults])
         return TwistBase.create(
             self.forward_limit_mps,
             self.turn_limit_radps,
@@ -111,7 +111,7 @@ def base_data(base: TwistBase) -> dict[str, Any]:
 
 
 def gyro_data(gyro: Gyro | None) -> dict[str, Any]:
-    """The block of a vehicle's file that tells of its gyro; nothing without one."""
+    """The block of a vehicle's file about its gyro; nothing without one."""
     if gyro is None:
         return {}
     figures = {field.name: float(getattr(gyro, field.name)) for field in dataclasses.fields(gyro)}

@@ -18,49 +18,56 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import Field
 
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import Count, Entry, ForeignEntry, Positive, Size, Text, at, validate
-from jaxnav.files.writing import atomic_write
+from jaxnav.files.writing import atomic_write, yaml_text
 
 Spacing = Annotated[Positive, within("spacing")]
 Squares = Annotated[int, Field(strict=True, ge=1, le=100)]
-_Side = Annotated[Size, Field(serialization_alias="size_m")]
-_KIND = Field(serialization_alias="kind")
+# The arguments of `Board` that our files call otherwise.
+_ARGUMENTS = {
+    "board": "kind",
+    "square_m": "size_m",
+    "tag_m": "size_m",
+    "step_m": "size_m",
+    "diameter_m": "marker_m",
+    "legacy": "white_top_left",
+}
 
 
 class _Own(Entry):
-    """A board in our own file; its aliases are the arguments of `Board`."""
+    """A board in our own file."""
 
     def figures(self) -> dict[str, Any]:
         """The arguments of `jaxnav.calibrate.board.board.Board`."""
-        return self.model_dump(by_alias=True)
+        own = {_ARGUMENTS.get(key, key): value for key, value in self.model_dump().items()}
+        return {"columns": 1, "rows": 1} | own
 
 
 class Charuco(_Own):
     """A board file's chessboard with markers in its white squares."""
 
-    board: Annotated[Literal["charuco"], _KIND]
+    board: Literal["charuco"]
     columns: Squares
     rows: Squares
-    square_m: _Side
+    square_m: Size
     marker_m: Size
     family: Text
     first_id: Count = 0
-    legacy: Annotated[bool, Field(strict=True, serialization_alias="white_top_left")] = False
+    legacy: Annotated[bool, Field(strict=True)] = False
 
 
 class Aprilgrid(_Own):
     """A board file's grid of tags with black squares between them."""
 
-    board: Annotated[Literal["aprilgrid"], _KIND]
+    board: Literal["aprilgrid"]
     columns: Squares
     rows: Squares
-    tag_m: _Side
+    tag_m: Size
     spacing: Spacing
     family: Text = "tag36h11"
     first_id: Count = 0
@@ -70,32 +77,29 @@ class Aprilgrid(_Own):
 class Chessboard(_Own):
     """A board file's chessboard of black and white squares."""
 
-    board: Annotated[Literal["chessboard"], _KIND]
+    board: Literal["chessboard"]
     columns: Squares
     rows: Squares
-    square_m: _Side
+    square_m: Size
 
 
 class Circles(_Own):
     """A board file's grid of discs, symmetric or not, as OpenCV counts them."""
 
-    board: Annotated[Literal["circles", "asymmetric_circles"], _KIND]
+    board: Literal["circles", "asymmetric_circles"]
     columns: Squares
     rows: Squares
-    step_m: _Side
-    diameter_m: Annotated[Size, Field(serialization_alias="marker_m")]
+    step_m: Size
+    diameter_m: Size
 
 
 class SingleMarker(_Own):
     """A board file's single navigation marker."""
 
-    board: Annotated[Literal["marker"], _KIND]
+    board: Literal["marker"]
     size_m: Size
     family: Text
     first_id: Count
-
-    def figures(self) -> dict[str, Any]:
-        return self.model_dump(by_alias=True) | {"columns": 1, "rows": 1}
 
 
 class KalibrAprilgrid(ForeignEntry):
@@ -149,12 +153,9 @@ def save_board(path: str | Path, figures: Mapping[str, Any]) -> None:
     Raises:
         BadInput: a figure is wrong, or the file can't be written.
     """
-    fields = _OWN[figures["kind"]].model_fields
-    entry = _own(
-        Path(path),
-        {key: figures[field.serialization_alias or key] for key, field in fields.items()},
-    )
-    atomic_write(path, yaml.safe_dump(entry.model_dump(), sort_keys=False))
+    keys = _OWN[figures["kind"]].model_fields
+    entry = _own(Path(path), {key: figures[_ARGUMENTS.get(key, key)] for key in keys})
+    atomic_write(path, yaml_text(entry.model_dump()))
 
 
 def _own(path: Path, data: dict[str, Any]) -> BoardFile:

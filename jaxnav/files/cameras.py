@@ -1,27 +1,23 @@
-"""Calibrated cameras, read from the files of several calibration tools.
+"""Calibrated cameras and rigs, read from the files of several calibration tools.
 
 The formats are jaxnav's own rig YAML, Kalibr's camchain, ROS's camera_info YAML, OpenCV's
 FileStorage YAML (as its calibration sample and most scripts write it) and PhotonVision's JSON. A
 file's keys tell its format.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from jaxnav.core.models.camera import Camera
+from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr
-from jaxnav.files.figures import CameraFigures
-from jaxnav.files.matrix_cameras import (
-    CameraInfo,
-    MatrixCamera,
-    OpenCVCamera,
-    PhotonVisionCamera,
-)
+from jaxnav.files.matrix_cameras import ONE_CAMERA_FORMATS
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import RigFile, rig_left_out
-from jaxnav.files.validation import validate
+from jaxnav.files.rigs import CameraEntry, RigFile, rig_left_out, rig_of
+from jaxnav.files.validation import at, validate
 
 ImageSizePx = tuple[int, int]  # width, height
 CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
@@ -32,20 +28,32 @@ class CameraFile:
     """The cameras of a file, with its format and the keys that were not read.
 
     Attributes:
-        cameras: under the names that the file gives them, at least one.
+        cameras: under the names that the file gives them, at least one; placed by
+            `T_camera_vehicle` or not at all.
         left_out: keys with values that no other file can be given.
     """
 
     format: CameraFormat
-    cameras: tuple[CameraFigures, ...]
+    cameras: tuple[CameraEntry, ...]
     left_out: tuple[str, ...]
 
 
-_ONE_CAMERA: dict[CameraFormat, type[MatrixCamera]] = {
-    "photonvision": PhotonVisionCamera,
-    "ros": CameraInfo,
-    "opencv": OpenCVCamera,
-}
+def load_rig(path: str | Path) -> CameraRig:
+    """Read a camera rig from jaxnav's own YAML, or a Kalibr camchain with imu := vehicle.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    path = Path(path)
+    data = read_mapping(path)
+    if "cameras" not in data and not kalibr.is_camchain(data):
+        raise BadInput(path, "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)")
+    cameras = camera_file(path, data, kalibr.names_by_tag_topic).cameras
+    for index, camera in enumerate(cameras):
+        if camera.T_camera_vehicle is None:
+            problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
+            raise BadInput(at(path, f"cam{index}", "T_cam_imu"), problem)
+    return rig_of(cameras)
 
 
 def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
@@ -59,12 +67,12 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
         BadInput: one line naming file and key; with the names to choose from where there are
             several cameras.
     """
-    figures = load_figures(Path(path), name)
-    return figures.camera(), figures.image_size_px
+    entry = load_camera_entry(Path(path), name)
+    return entry.camera(), entry.size_px
 
 
-def load_figures(path: Path, name: str | None) -> CameraFigures:
-    """Read the figures of one camera; the arguments and errors are those of `load_camera`."""
+def load_camera_entry(path: Path, name: str | None) -> CameraEntry:
+    """Read one camera with its name and sigmas; arguments and errors as of `load_camera`."""
     data = read_mapping(path)
     file = camera_file(path, data)
     if file.format in ("jaxnav", "kalibr"):
@@ -74,34 +82,34 @@ def load_figures(path: Path, name: str | None) -> CameraFigures:
     return file.cameras[0]
 
 
-def camera_file(path: Path, data: dict[str, Any], by_topic: bool = False) -> CameraFile:
+def camera_file(
+    path: Path,
+    data: dict[str, Any],
+    camchain_names: Callable[[dict[str, kalibr.KalibrCamera]], Sequence[str]] = list,
+) -> CameraFile:
     """All cameras of a file, whichever tool wrote it.
 
-    Cameras of a camchain are called `cam0`, `cam1` and so on; a camera without a name in its file
-    is called after the file.
+    A camera without a name in its file is called after the file.
 
     Args:
         data: the content of the file.
-        by_topic: whether a camchain's cameras are named after their topics instead, if they can be.
+        camchain_names: names the cameras of a camchain; by default `cam0`, `cam1` and so on.
 
     Raises:
         BadInput: one line naming file and key.
     """
     if "cameras" in data:
         rig = validate(RigFile, data, path)
-        cameras = tuple(entry.figures() for entry in rig.cameras)
+        cameras = tuple(entry.placed() for entry in rig.cameras)
         return CameraFile("jaxnav", cameras, tuple(rig_left_out(rig)))
     if kalibr.is_camchain(data):
         chain = kalibr.camchain(path, data)
-        left_out = kalibr.camchain_left_out(data, chain)
-        names = kalibr.names_by_topic(chain) if by_topic else list(chain)
-        figures = zip(kalibr.camchain_figures(chain), names, strict=True)
-        cameras = tuple(replace(camera, name=name) for camera, name in figures)
-        return CameraFile("kalibr", cameras, tuple(left_out))
-    for tool, model in _ONE_CAMERA.items():
-        if data.keys() & set(model.told_by):
+        cameras = tuple(kalibr.camchain_cameras(chain, camchain_names(chain)))
+        return CameraFile("kalibr", cameras, tuple(kalibr.camchain_left_out(data, chain)))
+    for tool, model in ONE_CAMERA_FORMATS.items():
+        if data.keys() & set(model.format_keys):
             stored = validate(model, data, path)
-            camera = stored.figures(path, _name(data.get("camera_name")) or path.stem)
+            camera = stored.camera(path, _name(data.get("camera_name")) or path.stem)
             return CameraFile(tool, (camera,), tuple(stored.left_out(data)))
     raise BadInput(
         path,
@@ -117,9 +125,7 @@ def _name(named: Any) -> str:
     return name if len(name) <= 100 and name.isprintable() else ""
 
 
-def choose_camera(
-    path: Path, cameras: tuple[CameraFigures, ...], name: str | None
-) -> CameraFigures:
+def choose_camera(path: Path, cameras: tuple[CameraEntry, ...], name: str | None) -> CameraEntry:
     """The camera of a name, or the only one.
 
     Raises:

@@ -8,18 +8,17 @@ places none of them on a vehicle.
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
 from jaxnav.core.models.rig import PLACED_BY_CALIBRATION
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import CameraFigures, Lens, coefficients_problem, unread_keys
 from jaxnav.files.ranges import pinhole_problem, placed_within
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import CameraEntry, CameraSigma, Lens, coefficients_problem, pose_entry
 from jaxnav.files.validation import (
     Coefficient,
     ForeignEntry,
@@ -27,8 +26,10 @@ from jaxnav.files.validation import (
     Matrix,
     MountMatrix,
     Number,
+    QuaternionPose,
     Text,
     at,
+    unread_keys,
     validate,
 )
 from jaxnav.files.writing import yaml_text
@@ -42,7 +43,6 @@ _LENS: dict[str, Lens] = {
 }
 # Camera models that are lenses: what precedes fu fv pu pv in their intrinsics are coefficients.
 _SPHERES: dict[str, Lens] = {"omni": "omni", "ds": "double_sphere", "eucm": "eucm"}
-_CAMERA_MODELS = ("pinhole", *_SPHERES)
 _LEADING = {"pinhole": (), "omni": ("xi",), "ds": ("xi", "alpha"), "eucm": ("alpha", "beta")}
 _BENT_BY = {
     "pinhole": tuple(_LENS),
@@ -57,7 +57,7 @@ _TOPIC = re.compile(r"/([^/].*)/image_raw")  # of the camera of that name
 class KalibrCamera(ForeignEntry):
     """One `camN` of a camchain."""
 
-    camera_model: Text
+    camera_model: Literal["pinhole", "omni", "ds", "eucm"]
     intrinsics: list[Number]
     distortion_model: Text = "none"
     distortion_coeffs: list[Coefficient] = Field(default_factory=list)
@@ -68,13 +68,6 @@ class KalibrCamera(ForeignEntry):
     rostopic: Text | None = None
     tagtopic: Text | None = None  # TagSLAM's: where the detections of this camera are published
     rig_body: Text | None = None  # TagSLAM's: the body that carries it
-
-    @field_validator("camera_model")
-    @classmethod
-    def _known_camera(cls, model: str) -> str:
-        if model not in _CAMERA_MODELS:
-            raise ValueError(f"must be one of {', '.join(_CAMERA_MODELS)}, got {model!r}")
-        return model
 
     @field_validator("intrinsics")
     @classmethod
@@ -122,24 +115,20 @@ class KalibrCamera(ForeignEntry):
             raise ValueError(f"intrinsics, resolution: {problem}")
         return self
 
-    def figures(
-        self,
-        name: str,
-        T_camera_vehicle: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"] | None = None,
-    ) -> CameraFigures:
+    def camera(
+        self, name: str, T_camera_vehicle: QuaternionPose | list[list[float]] | None = None
+    ) -> CameraEntry:
         """The camera under a given name at a given place, which Kalibr has calibrated."""
         bend = _LENS[self.distortion_model]
-        lens = _SPHERES.get(self.camera_model, bend)
-        coefficients = [*self.intrinsics[:-4], *(() if bend == "none" else self.distortion_coeffs)]
-        sigma = None if T_camera_vehicle is None else PLACED_BY_CALIBRATION
-        return CameraFigures.create(
+        placed = None if T_camera_vehicle is None else CameraSigma.from_place(PLACED_BY_CALIBRATION)
+        return CameraEntry.create(
             name,
-            lens,
+            _SPHERES.get(self.camera_model, bend),
             self.intrinsics[-4:],
-            coefficients,
+            [*self.intrinsics[:-4], *(() if bend == "none" else self.distortion_coeffs)],
             self.resolution,
-            T_camera_vehicle,
-            sigma,
+            T_camera_vehicle=T_camera_vehicle,
+            sigma=placed,
         )
 
 
@@ -164,20 +153,20 @@ def camchain(path: Path, data: dict[str, Any] | None = None) -> dict[str, Kalibr
     return {key: validate(KalibrCamera, data[key], path, key) for key in keys}
 
 
-def camchain_figures(chain: dict[str, KalibrCamera]) -> list[CameraFigures]:
-    """The cameras under their keys, `cam0` first; those without a place have none."""
-    cameras: list[CameraFigures] = []
-    place: np.ndarray | None = None
-    for key, entry in chain.items():
-        before, place = place, None
-        if entry.T_cam_imu is not None:
-            place = np.array(entry.T_cam_imu, float)
-        elif entry.T_imu_cam is not None:
-            place = poses.inverse(poses.pose_from_matrix(entry.T_imu_cam))
-        elif entry.T_cn_cnm1 is not None and before is not None:
+def camchain_cameras(
+    chain: dict[str, KalibrCamera], names: Sequence[str] | None = None
+) -> list[CameraEntry]:
+    """The cameras, `cam0` first, under their keys or other names; some may have no place."""
+    cameras: list[CameraEntry] = []
+    for name, entry in zip(names or list(chain), chain.values(), strict=True):
+        before = cameras[-1].T_camera_vehicle if cameras else None
+        place: Any = entry.T_cam_imu
+        if place is None and entry.T_imu_cam is not None:
+            place = pose_entry(poses.inverse(poses.pose_from_matrix(entry.T_imu_cam)))
+        elif place is None and entry.T_cn_cnm1 is not None and before is not None:
             step = poses.pose_from_matrix(entry.T_cn_cnm1)
-            place = poses.compose(step, poses.pose_as_read(before))
-        cameras.append(entry.figures(key, place))
+            place = pose_entry(poses.compose(step, poses.pose_as_read(before)))
+        cameras.append(entry.camera(name, place))
     return cameras
 
 
@@ -193,24 +182,29 @@ def names_by_topic(chain: dict[str, KalibrCamera]) -> list[str]:
     return names if len(set(names)) == len(names) else list(chain)
 
 
+def names_by_tag_topic(chain: dict[str, KalibrCamera]) -> list[str]:
+    """The names of the cameras by TagSLAM's `tagtopic`, or their keys."""
+    return [entry.tagtopic or key for key, entry in chain.items()]
+
+
 def camchain_left_out(data: dict[str, Any], chain: dict[str, KalibrCamera]) -> list[str]:
     """The keys that are not read and not empty, see `unread_keys`."""
     unread = unread_keys(data, list(chain))
     read = set(KalibrCamera.model_fields) - {"tagtopic", "rig_body"}
-    for key, camera in zip(chain, camchain_figures(chain), strict=True):
+    for key, camera in zip(chain, camchain_cameras(chain), strict=True):
         unplaced = {"T_cn_cnm1"} if camera.T_camera_vehicle is None else set()
         unread += unread_keys(data[key], sorted(read - unplaced), f"{key}.")
     return unread
 
 
-def camchain_text(cameras: Sequence[CameraFigures]) -> str:
+def camchain_text(cameras: Sequence[CameraEntry]) -> str:
     """The cameras as the text of a camchain; a single camera may have no place.
 
     Raises:
         BadInput: a lens that Kalibr does not know, or one of several cameras without a place.
     """
     data: dict[str, Any] = {}
-    Ts: list[np.ndarray] = []
+    Ts: list[np.ndarray] = []  # (4, 4)
     for index, camera in enumerate(cameras):
         where = f"--to kalibr: {camera.name}"
         entry: dict[str, Any] = {"cam_overlaps": [], **_lens_entry(where, camera)}
@@ -230,7 +224,7 @@ def camchain_text(cameras: Sequence[CameraFigures]) -> str:
     return yaml_text(data)
 
 
-def _lens_entry(where: str, camera: CameraFigures) -> dict[str, Any]:
+def _lens_entry(where: str, camera: CameraEntry) -> dict[str, Any]:
     """What a camchain says of a camera's lens."""
     coefficients = list(camera.distortion)
     model = next((key for key, lens in _SPHERES.items() if lens == camera.lens), "pinhole")

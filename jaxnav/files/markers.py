@@ -23,11 +23,9 @@ from pydantic import Field, field_validator, model_validator
 from jaxnav.core.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.origin import Origin, opposite, origin_near, poses_in_world
 from jaxnav.files import poses
-from jaxnav.files.figures import MarkerFigures
 from jaxnav.files.provenance import Calibrated
-from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import plain_pose, with_provenance, written_pose
-from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, validate
+from jaxnav.files.rigs import pose_entry, with_provenance
+from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, read
 from jaxnav.files.writing import atomic_write, yaml_text
 
 # The most that a corner may be off the best square, in sides: a tape measure's error.
@@ -42,7 +40,7 @@ class MarkerSigma(Entry):
 
 
 class MarkerEntry(Entry):
-    """One marker of a map file."""
+    """One marker of a map file, and of every other tool's file once it is read."""
 
     family: Text
     id: Count
@@ -79,14 +77,14 @@ class MarkerEntry(Entry):
             raise ValueError("needs exactly one of corners_world_m, T_world_marker")
         return self
 
-    def figures(self) -> MarkerFigures:
-        """The marker's figures, with the numbers of the file."""
+    def placed(self) -> "MarkerEntry":
+        """The same marker, with `T_world_marker` for its place and no sigma."""
+        T_world_marker = self.T_world_marker
         if self.corners_world_m is not None:
-            T_world_marker = fit_square(np.array(self.corners_world_m), self.size_m)
-        else:
-            assert self.T_world_marker is not None  # _placed_once
-            T_world_marker = written_pose(self.T_world_marker)
-        return MarkerFigures(self.id, self.family, float(self.size_m), T_world_marker)
+            T_world_marker = pose_entry(fit_square(np.array(self.corners_world_m), self.size_m))
+        return MarkerEntry.model_construct(
+            id=self.id, family=self.family, size_m=self.size_m, T_world_marker=T_world_marker
+        )
 
 
 class MarkerFile(Entry):
@@ -108,9 +106,8 @@ class MarkerFile(Entry):
 
     def map(self, origin_m: Origin | None = None) -> MarkerMap:
         """The map, in the process's precision; see `marker_map`."""
-        written = [entry.figures().T_world_marker for entry in self.markers]
         return marker_map(
-            np.stack([poses.pose_as_read(T) for T in written]),
+            np.stack([poses.pose_as_read(m.placed().T_world_marker) for m in self.markers]),
             [entry.size_m for entry in self.markers],
             [entry.id for entry in self.markers],
             [entry.family for entry in self.markers],
@@ -124,8 +121,7 @@ def load_markers(path: str | Path) -> MarkerMap:
     Raises:
         BadInput: one line naming file and key.
     """
-    path = Path(path)
-    return validate(MarkerFile, read_mapping(path), path).map()
+    return read(path, MarkerFile).map()
 
 
 def marker_map(
@@ -180,42 +176,30 @@ def marker_data(markers: MarkerMap) -> dict[str, Any]:
     Far from zero, places keep the digits that float64 has there: a nanometre at 10 000 km.
     """
     Ts_world_marker = poses_in_world(markers.Ts_world_marker.wxyz_xyz, markers.origin_m)
-    return figures_data(
-        [
-            MarkerFigures(
-                id=marker_id,
-                family=family,
-                size_m=float(markers.size_m[index]),
-                T_world_marker=np.asarray(Ts_world_marker[index], float),
-            )
-            for index, (marker_id, family) in enumerate(
-                zip(markers.ids, markers.families, strict=True)
-            )
-        ]
-    )
-
-
-def figures_data(markers: Sequence[MarkerFigures]) -> dict[str, Any]:
-    """The content of these markers' file in plain values."""
-    entries: list[dict[str, Any]] = [
-        {
-            "id": marker.id,
-            "family": marker.family,
-            "size_m": marker.size_m,
-            "T_world_marker": plain_pose(marker.T_world_marker),
-        }
-        for marker in markers
+    each = zip(markers.ids, markers.families, markers.size_m, Ts_world_marker, strict=True)
+    entries = [
+        MarkerEntry.model_construct(
+            id=marker_id,
+            family=family,
+            size_m=float(size_m),
+            T_world_marker=pose_entry(np.asarray(T, float)),
+        )
+        for marker_id, family, size_m, T in each
     ]
-    return {"markers": entries}
+    return _file_data(entries)
 
 
-def markers_text(markers: Sequence[MarkerFigures]) -> str:
+def _file_data(markers: Sequence[MarkerEntry]) -> dict[str, Any]:
+    return {"markers": [marker.model_dump(exclude_none=True) for marker in markers]}
+
+
+def markers_text(markers: Sequence[MarkerEntry]) -> str:
     """The markers as the text of a map file."""
-    return yaml_text(figures_data(markers))
+    return yaml_text(_file_data(markers))
 
 
 def markers_left_out(file: MarkerFile) -> list[str]:
-    """The names of the entries of a map file that `MarkerFigures` don't hold."""
+    """The names of the entries of a map file that other formats don't hold."""
     left_out = ["calibrated"] if file.calibrated else []
     sigmas = sum(entry.sigma is not None for entry in file.markers)
     return left_out + ([f"sigma (of {sigmas} markers)"] if sigmas else [])

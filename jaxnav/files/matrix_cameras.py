@@ -13,16 +13,16 @@ PhotonVision keeps snapshots of the board and results from them (`observations`)
 """
 
 import json
-from collections.abc import Container, Sequence
+from collections.abc import Container
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AliasChoices, Field, field_validator, model_validator
 
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures, Lens, unread_keys
 from jaxnav.files.ranges import pinhole_problem, problem_of
+from jaxnav.files.rigs import CameraEntry, Lens
 from jaxnav.files.validation import (
     Count,
     ForeignEntry,
@@ -32,8 +32,9 @@ from jaxnav.files.validation import (
     Text,
     at,
     show_value,
+    unread_keys,
 )
-from jaxnav.files.writing import Quoted, yaml_text
+from jaxnav.files.writing import yaml_text
 
 _LENS: dict[str, Lens] = {
     "plumb_bob": "radtan",
@@ -91,15 +92,18 @@ class MatrixCamera(ForeignEntry):
     """The file of one camera.
 
     Attributes:
-        told_by: the format's keys; a file that has one of them is of this format.
-        read: the keys that are read.
+        format_keys: a file that has one of them is of this format.
+        read_keys: what is read.
+        matrices: the fields of K and of the lens's coefficients.
     """
 
-    told_by: ClassVar[tuple[str, ...]]
-    read: ClassVar[tuple[str, ...]]
+    format_keys: ClassVar[tuple[str, ...]]
+    read_keys: ClassVar[tuple[str, ...]]
+    matrices: ClassVar[tuple[str, str]] = ("camera_matrix", "distortion_coefficients")
 
-    def figures(self, path: Path, name: str) -> CameraFigures:
-        """The camera under a given name.
+    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+        """Width and height of its images, px, and the kind of its lens: radtan for all of OpenCV's
+        that are no fisheye.
 
         Raises:
             BadInput: one line naming file and key.
@@ -108,31 +112,67 @@ class MatrixCamera(ForeignEntry):
 
     def left_out(self, data: dict[str, Any]) -> list[str]:
         """The keys of the file that are not read and not empty, see `unread_keys`."""
-        return unread_keys(data, self.read)
+        return unread_keys(data, self.read_keys)
+
+    def camera(self, path: Path, name: str) -> CameraEntry:
+        """The camera under a given name.
+
+        A radtan lens with more than five coefficients that matter is `rational`, with more than
+        eight `thin_prism`.
+
+        Raises:
+            BadInput: one line naming file and key: not calibrated, skewed, or a lens with more
+                coefficients than ours.
+        """
+        size_px, lens = self.size_and_lens(path)
+        K, coefficients = (getattr(self, field).data for field in self.matrices)
+        in_K, in_lens = (at(path, f"{field}.data") for field in self.matrices)
+        if len(K) != 9:
+            raise BadInput(in_K, f"must be 3 x 3, got {len(K)} numbers")
+        if K[0] == 0:
+            raise BadInput(f"{in_K}[0]", "is 0: this camera has not been calibrated")
+        for index in (0, 4):
+            if K[index] <= 0:
+                problem = f"the focal length must be > 0, got {K[index]:g}"
+                raise BadInput(f"{in_K}[{index}]", problem)
+        if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
+            raise BadInput(in_K, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
+        pinhole_px = [K[index] for index in (0, 4, 2, 5)]
+        if wrong := pinhole_problem(pinhole_px, size_px):
+            sizes = "image_width and image_height, or resolution"
+            raise BadInput(in_K, f"{wrong} ({sizes})")
+        if lens == "radtan" and any(coefficients[5:]):
+            lens = "thin_prism" if any(coefficients[8:]) else "rational"
+        most = LENS_COEFFICIENTS[lens]
+        if lens == "equidistant" and len(coefficients) != 4:
+            problem = f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}"
+            raise BadInput(in_lens, problem)
+        if any(coefficients[most:]):
+            raise BadInput(
+                in_lens, "has tilt coefficients that are not zero: calibrate again with twelve "
+                "(thin_prism), eight (rational) or five (plumb_bob, radtan)",
+            )  # fmt: skip
+        for index, value in enumerate(coefficients[:most]):
+            if wrong := problem_of("distortion", value):
+                raise BadInput(f"{in_lens}[{index}]", wrong)
+        return CameraEntry.create(name, lens, pinhole_px, coefficients[:most], size_px)
 
 
 class CameraInfo(MatrixCamera):
     """A camera in ROS's camera_info YAML."""
 
-    told_by = ("distortion_model",)
+    format_keys = ("distortion_model",)
     image_width: Pixels
     image_height: Pixels
     camera_matrix: MatrixEntry
     distortion_model: Text
     distortion_coefficients: MatrixEntry
 
-    def figures(self, path: Path, name: str) -> CameraFigures:
-        model = self.distortion_model
-        if model not in _LENS:
-            problem = f"must be one of {', '.join(_LENS)}, got {model!r}"
+    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+        if self.distortion_model not in _LENS:
+            problem = f"must be one of {', '.join(_LENS)}, got {self.distortion_model!r}"
             raise BadInput(at(path, "distortion_model"), problem)
-        return _figures_from_matrices(
-            name,
-            (self.image_width, self.image_height),
-            (at(path, "camera_matrix.data"), self.camera_matrix.data),
-            (at(path, "distortion_coefficients.data"), self.distortion_coefficients.data),
-            _LENS[model],
-        )
+        return [self.image_width, self.image_height], _LENS[self.distortion_model]
 
     def left_out(self, data: dict[str, Any]) -> list[str]:
         # A rectification is no part of a camera.
@@ -151,8 +191,8 @@ class CameraInfo(MatrixCamera):
 class OpenCVCamera(MatrixCamera):
     """A camera in OpenCV's FileStorage."""
 
-    told_by = _OPENCV_K
-    read = (*_OPENCV_K, *_OPENCV_D, *_OPENCV_SIZE, "fisheye_model", "camera_name")
+    format_keys = _OPENCV_K
+    read_keys = (*_OPENCV_K, *_OPENCV_D, *_OPENCV_SIZE, "fisheye_model", "camera_name")
     image_width: Pixels | None = None
     image_height: Pixels | None = None
     image_size: Annotated[
@@ -164,21 +204,14 @@ class OpenCVCamera(MatrixCamera):
     ]
     fisheye_model: Annotated[int, Field(strict=True, ge=0, le=1)] = 0
 
-    def figures(self, path: Path, name: str) -> CameraFigures:
-        size = self.image_size
-        if size is None:
-            if self.image_width is None or self.image_height is None:
-                missing = "image_width" if self.image_width is None else "image_height"
-                problem = "missing: for which image size are these figures?"
-                raise BadInput(at(path, missing), problem)
-            size = [self.image_width, self.image_height]
-        return _figures_from_matrices(
-            name,
-            size,
-            (at(path, "camera_matrix.data"), self.camera_matrix.data),
-            (at(path, "distortion_coefficients.data"), self.distortion_coefficients.data),
-            "equidistant" if self.fisheye_model else "radtan",
-        )
+    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+        lens: Lens = "equidistant" if self.fisheye_model else "radtan"
+        if self.image_size is not None:
+            return self.image_size, lens
+        if self.image_width is None or self.image_height is None:
+            missing = "image_width" if self.image_width is None else "image_height"
+            raise BadInput(at(path, missing), "missing: for which image size are these figures?")
+        return [self.image_width, self.image_height], lens
 
 
 _PhotonVisionSide = Annotated[float, Field(strict=True, ge=1, le=65536)]
@@ -201,27 +234,29 @@ class Resolution(ForeignEntry):
 class PhotonVisionCamera(MatrixCamera):
     """PhotonVision's JSON of a camera; older versions wrote the lens under `cameraExtrinsics`."""
 
-    told_by = ("cameraIntrinsics",)
-    read = ("resolution", "cameraIntrinsics", "lensmodel", *_PHOTONVISION_D)
+    format_keys = ("cameraIntrinsics",)
+    read_keys = ("resolution", "cameraIntrinsics", "lensmodel", *_PHOTONVISION_D)
+    matrices = ("cameraIntrinsics", "distCoeffs")
     resolution: Resolution
     cameraIntrinsics: MatrixEntry
     distCoeffs: Annotated[MatrixEntry, Field(validation_alias=AliasChoices(*_PHOTONVISION_D))]
     lensmodel: Text = _PHOTONVISION_LENS
 
-    def figures(self, path: Path, name: str) -> CameraFigures:
+    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
         if "OPENCV" not in self.lensmodel:
             problem = f"must be an OpenCV lens, got {self.lensmodel!r}"
             raise BadInput(at(path, "lensmodel"), problem)
-        return _figures_from_matrices(
-            name,
-            (int(self.resolution.width), int(self.resolution.height)),
-            (at(path, "cameraIntrinsics.data"), self.cameraIntrinsics.data),
-            (at(path, "distCoeffs.data"), self.distCoeffs.data),
-            "radtan",
-        )
+        return [int(self.resolution.width), int(self.resolution.height)], "radtan"
 
 
-def camera_info_text(camera: CameraFigures) -> str:
+ONE_CAMERA_FORMATS: dict[Literal["photonvision", "ros", "opencv"], type[MatrixCamera]] = {
+    "photonvision": PhotonVisionCamera,
+    "ros": CameraInfo,
+    "opencv": OpenCVCamera,
+}
+
+
+def camera_info_text(camera: CameraEntry) -> str:
     """The camera as the text of ROS's camera_info file.
 
     Raises:
@@ -232,7 +267,7 @@ def camera_info_text(camera: CameraFigures) -> str:
     data = {
         "image_width": camera.image_size_px[0],
         "image_height": camera.image_size_px[1],
-        "camera_name": Quoted(camera.name),
+        "camera_name": camera.name,
         "camera_matrix": _matrix(3, 3, K),
         "distortion_model": _MODEL[camera.lens],
         "distortion_coefficients": _matrix(1, len(D), D),
@@ -242,7 +277,7 @@ def camera_info_text(camera: CameraFigures) -> str:
     return yaml_text(data)
 
 
-def opencv_text(camera: CameraFigures) -> str:
+def opencv_text(camera: CameraEntry) -> str:
     """The camera as the text of OpenCV's FileStorage file.
 
     Raises:
@@ -267,7 +302,7 @@ def opencv_text(camera: CameraFigures) -> str:
     )
 
 
-def photonvision_text(camera: CameraFigures) -> str:
+def photonvision_text(camera: CameraEntry) -> str:
     """The camera as PhotonVision's JSON, with no snapshots.
 
     Raises:
@@ -289,7 +324,7 @@ def photonvision_text(camera: CameraFigures) -> str:
     return json.dumps(data, indent=2) + "\n"
 
 
-def _require_held(to: str, what: str, camera: CameraFigures, lenses: Container[str]) -> None:
+def _require_held(to: str, what: str, camera: CameraEntry, lenses: Container[str]) -> None:
     if camera.lens not in lenses:
         raise BadInput(
             f"--to {to}: {camera.name}.lens",
@@ -297,54 +332,7 @@ def _require_held(to: str, what: str, camera: CameraFigures, lenses: Container[s
         )
 
 
-def _figures_from_matrices(
-    name: str,
-    image_size_px: Sequence[int],
-    matrix: tuple[str, Sequence[float]],
-    distortion: tuple[str, Sequence[float]],
-    lens: Lens,
-) -> CameraFigures:
-    """A camera from K and the lens's coefficients; each comes with its key in the file.
-
-    Raises:
-        BadInput: not calibrated, skewed, or a lens with more coefficients than ours.
-
-    Returns:
-        The camera; a `radtan` lens with more than five coefficients that matter is `rational`,
-        with more than eight `thin_prism`.
-    """
-    where, K = matrix
-    if len(K) != 9:
-        raise BadInput(where, f"must be 3 x 3, got {len(K)} numbers")
-    if K[0] == 0:
-        raise BadInput(f"{where}[0]", "is 0: this camera has not been calibrated")
-    for index in (0, 4):
-        if K[index] <= 0:
-            raise BadInput(f"{where}[{index}]", f"the focal length must be > 0, got {K[index]:g}")
-    if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
-        raise BadInput(where, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
-    pinhole_px = [K[index] for index in (0, 4, 2, 5)]
-    if problem := pinhole_problem(pinhole_px, image_size_px):
-        sizes = "image_width and image_height, or resolution"
-        raise BadInput(where, f"{problem} ({sizes})")
-    where, coefficients = distortion
-    if lens == "radtan" and any(coefficients[5:]):
-        lens = "thin_prism" if any(coefficients[8:]) else "rational"
-    most = LENS_COEFFICIENTS[lens]
-    if lens == "equidistant" and len(coefficients) != 4:
-        raise BadInput(where, f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}")
-    if any(coefficients[most:]):
-        raise BadInput(
-            where, "has tilt coefficients that are not zero: calibrate again with twelve "
-            "(thin_prism), eight (rational) or five (plumb_bob, radtan)",
-        )  # fmt: skip
-    for index, value in enumerate(coefficients[:most]):
-        if problem := problem_of("distortion", value):
-            raise BadInput(f"{where}[{index}]", problem)
-    return CameraFigures.create(name, lens, pinhole_px, coefficients[:most], image_size_px)
-
-
-def _pinhole_matrix(camera: CameraFigures) -> list[float]:
+def _pinhole_matrix(camera: CameraEntry) -> list[float]:
     """K of a camera, 9 numbers row by row."""
     (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
     return [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
@@ -355,7 +343,7 @@ def _projection(K: list[float]) -> list[float]:
     return [*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0]
 
 
-def _coefficients(camera: CameraFigures) -> list[float]:
+def _coefficients(camera: CameraEntry) -> list[float]:
     """D of a camera: k1 k2 p1 p2 k3 [k4 k5 k6 [s1 s2 s3 s4]], k1 k2 k3 k4 of a fisheye, zeros
     without a lens."""
     return list(camera.distortion) if camera.lens != "none" else [0.0] * 5

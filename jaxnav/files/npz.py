@@ -1,7 +1,7 @@
 """Reading of .npz files of any bytes, with a bound on the memory for their arrays.
 
-NumPy takes memory for the shape that an array declares, and zip unpacks a thousandfold. So shape
-and dtype are checked first, and no more bytes are unpacked than they need.
+NumPy takes memory for the shape that an array declares, and zip unpacks a thousandfold. So all
+shapes and dtypes are read and added up before an array is.
 """
 
 import math
@@ -28,46 +28,34 @@ def read_npz(
         BadInput: it is no regular file, or can't be opened.
         Exception: any that the bytes lead to in NumPy, zipfile, zlib and here.
     """
-    arrays: dict[str, np.ndarray] = {}
-    left = limits.NPZ_BYTES
     with open_file(path) as file:
         if file.read(6) == np.lib.format.MAGIC_PREFIX:
             raise ValueError("it holds a single array")
         archive = zipfile.ZipFile(cast(IO[bytes], _Bounded(file)))
-        for info in archive.infolist():
-            key = info.filename.removesuffix(".npy")
-            if keys is not None and key not in keys:
-                continue
-            if key in arrays:
-                raise ValueError(f"it holds {key!r} twice")
+        members = [(info.filename.removesuffix(".npy"), info) for info in archive.infolist()]
+        wanted = [(key, info) for key, info in members if keys is None or key in keys]
+        if len(dict(wanted)) < len(wanted):
+            raise ValueError("it holds an array twice")
+        left = limits.NPZ_BYTES
+        for key, info in wanted:
             with archive.open(info) as stream:
-                arrays[key] = _array(key, stream, left)
-            left -= arrays[key].nbytes
-    return arrays
+                left -= _declared_bytes(key, stream)
+            if left < 0:
+                raise ValueError(f"{key}: is too large")
+        arrays = {}
+        for key, info in wanted:
+            with archive.open(info) as stream:
+                arrays[key] = np.lib.format.read_array(stream, allow_pickle=False)
+        return arrays
 
 
-def _array(key: str, stream: IO[bytes], most_bytes: int) -> np.ndarray:
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):  # other versions' headers may have 4 GiB; our files need none
-        raise ValueError(f"{key}: the version {version} of .npy is not read")
-    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    count = math.prod(shape)
-    if dtype.hasobject:
-        raise ValueError(f"Object arrays are pickles and not read: {key}")
+def _declared_bytes(key: str, stream: IO[bytes]) -> int:
+    if np.lib.format.read_magic(stream) != (1, 0):  # others' headers may have 4 GiB
+        raise ValueError(f"{key}: only version 1.0 of .npy is read")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
     if not dtype.itemsize or min(shape, default=0) < 0:
         raise ValueError(f"{key}: neither numbers nor text")
-    if count * dtype.itemsize > most_bytes:
-        raise ValueError(f"{key}: {shape} of {dtype} is too large")
-    raw = bytearray(count * dtype.itemsize)
-    at = 0
-    while at < len(raw):
-        piece = stream.read(min(_PIECE, len(raw) - at))
-        if not piece:
-            raise ValueError(f"{key}: ends too early")
-        raw[at : at + len(piece)] = piece
-        at += len(piece)
-    array = np.frombuffer(raw, dtype)
-    return array.reshape(shape[::-1]).T if is_fortran else array.reshape(shape)
+    return math.prod(shape) * dtype.itemsize
 
 
 class _Bounded:

@@ -13,7 +13,8 @@ may be `.inf`, which is no gate. The provenance is kept and shown, and decides n
 """
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,23 +23,31 @@ from typing import Annotated, Any
 
 import jax.numpy as jnp
 import numpy as np
-import yaml
 from jaxtyping import Float
 from pydantic import Field
 
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
+from jaxnav.core.parameters import (
+    TUNABLES,
+    Tunable,
+    allowed_shapes,
+    parameters_of,
+    with_parameters,
+)
 from jaxnav.errors import BadInput
-from jaxnav.files.param_values import param_array
-from jaxnav.files.reading import read_mapping
-from jaxnav.files.validation import Entry, at, validate
-from jaxnav.files.writing import PlainDumper, atomic_write, plain_data
+from jaxnav.files.validation import Entry, at, read, show_value, validate
+from jaxnav.files.writing import atomic_write, plain_data, yaml_text
 
 _LONGEST_SHOWN = 300  # characters of a provenance in a line
+_LEAST, _MOST = 1e-18, 1e9  # bounds of a number, so that float32 holds its square
+_MOST_ENTRIES = 64  # of a list, and rows of a matrix
+# Bound for the matrix of correlations, whose entries float32 rounds by 6e-8.
+_LEAST_EIGENVALUE = 1e-6
+_SYMMETRY = 1e-6  # relative to the geometric mean of the two variances: what float32 leaves
 
 
 class ParamsFile(Entry):
-    """A file of tuned parameters, whose values `Params.of` checks."""
+    """A file of tuned parameters, whose values `Params.from_values` checks."""
 
     parameters: Annotated[dict[str, Any], Field(min_length=1)]
     provenance: dict[str, Any] = Field(default_factory=dict)
@@ -61,7 +70,7 @@ class Params:
     prefix: str = field(default="", kw_only=True)
 
     @staticmethod
-    def of(
+    def from_values(
         values: Mapping[str, Any],
         path: str | Path,
         provenance: Mapping[str, Any] | None = None,
@@ -96,7 +105,7 @@ class Params:
         return replace(self, values=values)
 
     def plain(self) -> dict[str, Any]:
-        """The values as numbers and nested lists, bit for bit, of which `of` makes the same."""
+        """The values as plain numbers and lists, bit for bit: `from_values` makes the same."""
         return {name: value.tolist() for name, value in self.values.items()}
 
     def describe(self) -> str:
@@ -118,9 +127,8 @@ def load_params(path: str | Path) -> Params:
     Raises:
         BadInput: one line naming file and key.
     """
-    path = Path(path)
-    entry = validate(ParamsFile, read_mapping(path), path)
-    return Params.of(entry.parameters, path, entry.provenance)
+    entry = read(path, ParamsFile)
+    return Params.from_values(entry.parameters, path, entry.provenance)
 
 
 def write_params(
@@ -140,16 +148,16 @@ def write_params(
     path = Path(path)
     if path.suffix.lower() == ".json":
         raise BadInput(path, "must not be called .json: it is written as YAML")
-    params = Params.of(values, path, plain_data(dict(provenance or {})))
+    params = Params.from_values(values, path, plain_data(dict(provenance or {})))
     plain = params.plain()
     validate(ParamsFile, {"parameters": plain}, path)
     text = "parameters:\n"
     for name, tunable in TUNABLES.items():
         if name in plain:
             comment = f"# {tunable.meaning} [{tunable.unit}]\n"
-            text += indent(comment + _yaml_text({name: plain[name]}), "  ")
+            text += indent(comment + yaml_text({name: plain[name]}), "  ")
     if params.provenance:
-        text += _yaml_text({"provenance": params.provenance})
+        text += yaml_text({"provenance": params.provenance})
     atomic_write(path, text)
 
 
@@ -202,24 +210,102 @@ def _counted(shape: tuple[int, ...]) -> str:
     return f"{shape[0]} rows of {shape[1]}"
 
 
-class _Dumper(PlainDumper):
-    """A dumper with rows on one line, and texts that can't pass for numbers."""
+def param_array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "..."]:
+    """Check a parameter's numbers and return them unchanged as an array (), (d,) or (d, d).
+
+    Every number must be positive, and a matrix a covariance. One that only bounds what is believed
+    may be infinite. The navigator decides how many entries there must be.
+
+    Args:
+        value: plain, or an array.
+        where: file and key, for the message.
+        tunable: what the parameter may be.
+
+    Raises:
+        BadInput: the value is anything else; names its place in the list.
+    """
+    value = _plain(value)
+    if tunable.guard and isinstance(value, float) and not math.isfinite(value):
+        if value != math.inf:
+            raise BadInput(where, f"must be > 0 and finite, or .inf for none, got {value}")
+        return np.array(value)
+    if not isinstance(value, list):
+        return np.array(_positive(value, where, *tunable.most[:1]))
+    if not 1 <= len(value) <= _MOST_ENTRIES:
+        raise BadInput(where, f"must have 1 to {_MOST_ENTRIES} entries, got {len(value)}")
+    if not any(isinstance(entry, list) for entry in value):
+        return np.array(_positives(value, where, tunable.most))
+    if not tunable.rows and tunable.matrix is None:
+        raise BadInput(where, "can't be a matrix: it is a number, or a list of them")
+    count = len(tunable.most) if tunable.rows else len(value)
+    for i, row in enumerate(value):
+        if not isinstance(row, list) or len(row) != count:
+            got = f"{len(row)} numbers" if isinstance(row, list) else show_value(row)
+            because = "" if tunable.rows else f", as the matrix has {count} rows"
+            raise BadInput(f"{where}[{i}]", f"must have {count} numbers{because}, got {got}")
+    if tunable.rows:
+        return np.array(
+            [_positives(row, f"{where}[{i}]", tunable.most) for i, row in enumerate(value)]
+        )
+    return _covariance(
+        np.array(
+            [
+                [_number(entry, f"{where}[{i}][{j}]", _MOST**2) for j, entry in enumerate(row)]
+                for i, row in enumerate(value)
+            ]
+        ),
+        where,
+    )
 
 
-def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
-    # A number of YAML 1.2, such as 1e-5 or 08, may be a word to PyYAML; it begins like a number.
-    style = None if text[:1].isalpha() else '"'
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return [_plain(entry) for entry in value] if isinstance(value, list | tuple) else value
 
 
-def _list(dumper: _Dumper, entries: list[Any]) -> yaml.SequenceNode:
-    is_row = not any(isinstance(entry, list | dict) for entry in entries)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", entries, flow_style=is_row)
+def _number(value: Any, where: str, most: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadInput(where, f"must be a number, got {show_value(value)}")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise BadInput(where, f"must be finite, got {value}")
+    if not -most <= value <= most:
+        raise BadInput(where, f"must be from {-most:g} to {most:g}, got {show_value(value)}")
+    return float(value)
 
 
-_Dumper.add_representer(str, _text)
-_Dumper.add_representer(list, _list)
+def _positive(value: Any, where: str, most: float = math.inf) -> float:
+    number = _number(value, where, _MOST)
+    if number < _LEAST:
+        bound = "> 0" if number <= 0 else f"at least {_LEAST:g}"
+        raise BadInput(where, f"must be {bound}, got {number:g}")
+    if number > most:
+        raise BadInput(where, f"must be at most {most:g}, got {number:g}")
+    return number
 
 
-def _yaml_text(data: dict[str, Any]) -> str:
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=200)
+def _positives(values: list[Any], where: str, most: Sequence[float]) -> list[float]:
+    bounds = [*most, *[math.inf] * len(values)]
+    return [_positive(value, f"{where}[{i}]", bounds[i]) for i, value in enumerate(values)]
+
+
+def _covariance(matrix: np.ndarray, where: str) -> np.ndarray:
+    variances = np.diagonal(matrix)
+    for i, variance in enumerate(variances):
+        if variance < _LEAST**2:
+            problem = f"a variance must be at least {_LEAST**2:g}, got {variance:g}"
+            raise BadInput(f"{where}[{i}][{i}]", problem)
+    scale = np.sqrt(variances[:, None] * variances)
+    apart = np.abs(matrix - matrix.T) / scale
+    if apart.max() > _SYMMETRY:
+        i, j = np.unravel_index(apart.argmax(), apart.shape)
+        problem = f"must equal [{j}][{i}], {matrix[j, i]:g}, in a symmetric matrix"
+        raise BadInput(f"{where}[{i}][{j}]", f"{problem}, got {matrix[i, j]:g}")
+    least = np.linalg.eigvalsh((matrix + matrix.T) / 2 / scale).min()
+    if least < _LEAST_EIGENVALUE:
+        raise BadInput(
+            where,
+            f"must be positive definite: the least eigenvalue of its correlations is {least:.3g}, "
+            f"and must be at least {_LEAST_EIGENVALUE:g}",
+        )
+    return matrix

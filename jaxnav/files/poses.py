@@ -1,14 +1,15 @@
 """Rigid transforms as files hold them, in NumPy's float64 whatever JAX's precision is.
 
-A pose is the (7,) array of jaxlie: quaternion w x y z, then translation in m. A pose as it is
-written is such an array or a 4x4, with the file's numbers: not rounded, repaired or normalised.
+A pose is the (7,) array of jaxlie: quaternion w x y z, then translation in m.
 """
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 # Rounding in a file is repaired up to this deviation; beyond, the matrix is no rotation.
 _MAX_DEVIATION = 1e-3
@@ -47,34 +48,9 @@ def check_quaternion(wxyz: list[float]) -> list[float]:
 def pose_from_matrix(
     T: Sequence[Sequence[float]] | np.ndarray,
 ) -> Float[np.ndarray, " 7"]:
-    """The pose (7,) of a 4x4 that `check_matrix` accepts; R becomes the nearest rotation.
-
-    Source: Shepperd (1978), "Quaternion from rotation matrix".
-    """
+    """The pose (7,) of a 4x4 that `check_matrix` accepts; R becomes the nearest rotation."""
     T = np.asarray(T, float)
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    R = U @ Vt
-    four_squares = np.array(
-        [
-            1 + R[0, 0] + R[1, 1] + R[2, 2],
-            1 + R[0, 0] - R[1, 1] - R[2, 2],
-            1 - R[0, 0] + R[1, 1] - R[2, 2],
-            1 - R[0, 0] - R[1, 1] + R[2, 2],
-        ]
-    )
-    minus = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    plus = np.array([R[2, 1] + R[1, 2], R[0, 2] + R[2, 0], R[1, 0] + R[0, 1]])
-    largest = int(np.argmax(four_squares))
-    # Row i of the symmetric matrix 4 q q'.
-    row = np.array(
-        [
-            [four_squares[0], minus[0], minus[1], minus[2]],
-            [minus[0], four_squares[1], plus[2], plus[1]],
-            [minus[1], plus[2], four_squares[2], plus[0]],
-            [minus[2], plus[1], plus[0], four_squares[3]],
-        ]
-    )[largest]
-    return np.concatenate([row / np.linalg.norm(row), T[:3, 3]])
+    return _pose(Rotation.from_matrix(T[:3, :3]), T[:3, 3])
 
 
 def pose_from_quaternion(
@@ -86,20 +62,16 @@ def pose_from_quaternion(
     return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, np.asarray(xyz_m, float)])
 
 
-def pose_as_read(
-    written: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, " 7"]:
-    """The pose (7,) of a pose as it is written, (7,) or (4, 4)."""
-    if written.shape == (4, 4):
+def pose_as_read(written: Any) -> Float[np.ndarray, " 7"]:
+    """The pose (7,) of one as a file has it: the rows of a 4x4, or `wxyz` and `xyz_m`."""
+    if isinstance(written, list):
         return pose_from_matrix(written)
-    return pose_from_quaternion(written[:4], written[4:])
+    return pose_from_quaternion(written.wxyz, written.xyz_m)
 
 
-def matrix_as_read(
-    written: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "4 4"]:
-    """The 4x4 of a pose as it is written, (7,) or (4, 4)."""
-    return written if written.shape == (4, 4) else matrix(written)
+def matrix_as_read(written: Any) -> Float[np.ndarray, "4 4"]:
+    """The 4x4 of one as a file has it, the file's own numbers where it is a 4x4 there."""
+    return np.array(written, float) if isinstance(written, list) else matrix(pose_as_read(written))
 
 
 def quaternion_product(p: Sequence[float], q: Sequence[float]) -> list[float]:
@@ -118,12 +90,11 @@ def pose_from_rotation_vector(
     rotation_rad: Sequence[float], xyz_m: Sequence[float]
 ) -> Float[np.ndarray, " 7"]:
     """The pose (7,) of a rotation vector, rad, and a translation, m."""
-    rotation = np.asarray(rotation_rad, float)
-    half = np.linalg.norm(rotation) / 2
-    # sin(half) / (2 half), which tends to 1/2
-    return np.concatenate(
-        [[np.cos(half)], rotation / 2 * np.sinc(half / np.pi), np.asarray(xyz_m, float)]
-    )
+    return _pose(Rotation.from_rotvec(np.asarray(rotation_rad, float)), xyz_m)
+
+
+def _pose(rotation: Rotation, xyz_m: Sequence[float] | np.ndarray) -> Float[np.ndarray, " 7"]:
+    return np.concatenate([rotation.as_quat(scalar_first=True), np.asarray(xyz_m, float)])
 
 
 def transform(
@@ -138,13 +109,7 @@ def transform(
 
 def matrix(pose: Float[np.ndarray, " 7"]) -> Float[np.ndarray, "4 4"]:
     """The 4x4 of a pose (7,)."""
-    w, x, y, z = pose[:4] / np.linalg.norm(pose[:4])
-    R = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return transform(np.array(R), pose[4:])
+    return transform(Rotation.from_quat(pose[:4], scalar_first=True).as_matrix(), pose[4:])
 
 
 def inverse(pose: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
@@ -185,11 +150,7 @@ def rotation_towards(
         elevation_deg: positive looks up.
         roll_deg: positive turns the camera clockwise as seen from behind it.
     """
-    yaw, up, roll = np.deg2rad([yaw_deg, elevation_deg, roll_deg])
-    about_z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    about_y = np.array([[np.cos(up), 0, -np.sin(up)], [0, 1, 0], [np.sin(up), 0, np.cos(up)]])
-    forward = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # right, down, forward in x y z
-    about_axis = np.array(
-        [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
-    )
-    return about_z @ about_y @ forward @ about_axis
+    forward = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]  # right, down, forward in x y z
+    about_axis = Rotation.from_euler("z", roll_deg, degrees=True)
+    towards = Rotation.from_euler("ZY", [yaw_deg, -elevation_deg], degrees=True)
+    return (towards * Rotation.from_matrix(forward) * about_axis).as_matrix()

@@ -169,34 +169,17 @@ def pinhole_problem(pinhole_px: Sequence[float], image_size_px: Sequence[float])
         image_size_px: width, height.
     """
     width, height = image_size_px
-    of_images = f"for images of {width:g} x {height:g} px"
-    for name, value in zip(("fx", "fy"), pinhole_px[:2], strict=True):
-        if problem := _problem_in_sides("focal", value, max(width, height)):
-            return f"the focal length {name} {problem} {of_images}"
-    for name, value, side in zip(("cx", "cy"), pinhole_px[2:], (width, height), strict=True):
-        if problem := _problem_in_sides("center", value, side):
-            return f"the principal point's {name} {problem} {of_images}"
+    longer = max(width, height)
+    for value, name, side, what in zip(
+        pinhole_px,
+        ("focal", "focal", "center", "center"),
+        (longer, longer, width, height),
+        ("focal length fx", "focal length fy", "principal point's cx", "principal point's cy"),
+        strict=True,
+    ):
+        least, most = RANGES[name].least * side, RANGES[name].most * side
+        allowed = Range(least, most, "px", RANGES[name].what)
+        if not allowed.holds(value):
+            problem = outside(allowed, float(value))
+            return f"the {what} {problem} for images of {width:g} x {height:g} px"
     return None
-
-
-def _problem_in_sides(name: str, value: float, side: float) -> str | None:
-    parts = RANGES[name]
-    allowed = Range(parts.least * side, parts.most * side, "px", parts.what)
-    return None if allowed.holds(value) else outside(allowed, float(value))
-
-
-def table() -> str:
-    """A table of all ranges in Markdown."""
-    lines = ["| quantity | from | to | unit | outside of it |", "|---|---|---|---|---|"]
-    for allowed in RANGES.values():
-        bounds = f"{_number(allowed.least)} | {_number(allowed.most)}"
-        lines.append(f"| {allowed.what} | {bounds} | {allowed.unit} | {allowed.outside} |")
-    return "\n".join(lines) + "\n"
-
-
-def _number(value: float) -> str:
-    for power in (62, 63):
-        for sign, off in ((1, -1), (-1, 1), (-1, 0)):
-            if value == sign * 2**power + off and isinstance(value, int):
-                return f"{'-' if sign < 0 else ''}2^{power}{f' {off:+d}' if off else ''}"
-    return f"{value:.10g}"

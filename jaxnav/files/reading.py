@@ -16,12 +16,6 @@ from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import yaml
-from yaml.composer import Composer
-from yaml.constructor import SafeConstructor
-from yaml.parser import Parser
-from yaml.reader import Reader
-from yaml.resolver import Resolver
-from yaml.scanner import Scanner
 
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
@@ -106,20 +100,19 @@ def parse_yaml(path: Path, text: str) -> Any:
     if text.startswith("%YAML:"):
         text = "#" + text
     try:
-        return _Loader(text).get_single_data()
+        _check_size(text)
+        return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         # libyaml sees the end of a file on the line after its last one.
         last = max(len(text.splitlines()), 1)
         line = f"line {min(mark.line + 1, last)}: " if mark else ""
-        raise BadInput(path, f"is not valid YAML: {line}{error.problem or error.context}") from None
+        problem = f"{line}{error.problem or error.context}"
     except yaml.YAMLError as error:  # a character that YAML does not allow
-        raise BadInput(path, f"is not valid YAML: {str(error).splitlines()[0]}") from None
-    except (
-        ValueError,
-        OverflowError,
-    ) as error:  # an escape beyond Unicode, a number of 10 000 digits
-        raise BadInput(path, f"is not valid YAML: {error}") from None
+        problem = str(error).splitlines()[0]
+    except (ValueError, OverflowError) as error:  # an escape beyond Unicode, 10 000 digits
+        problem = str(error)
+    raise BadInput(path, f"is not valid YAML: {problem}")
 
 
 def parse_json(path: Path, text: str) -> Any:
@@ -145,66 +138,54 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return mapping
 
 
-try:
-    # libyaml: a tenth of the time
-    from yaml.cyaml import CParser as _Parser  # type: ignore[attr-defined]
-except ImportError:  # a PyYAML that was built without it
-
-    class _Parser(Reader, Scanner, Parser):  # type: ignore[no-redef]
-        """PyYAML's own parser, in Python."""
-
-        def __init__(self, stream: str):
-            Reader.__init__(self, stream)
-            Scanner.__init__(self)
-            Parser.__init__(self)
+# libyaml: a tenth of the time. A PyYAML may have been built without it.
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class _Loader(Composer, _Parser, SafeConstructor, Resolver):
-    """A stricter version of PyYAML's safe loader."""
+def _check_size(text: str) -> None:
+    """Refuse aliases, and more or deeper values than any honest file has, before any is made."""
+    depth = values = 0
+    for event in yaml.parse(text, Loader=_SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            _refuse("aliases (*name) are not supported", event)
+        if isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.NodeEvent):
+            values += 1
+            depth += isinstance(event, yaml.CollectionStartEvent)
+        if depth > limits.DEPTH:
+            _refuse(f"nested deeper than {limits.DEPTH} levels", event)
+        if values > limits.YAML_VALUES:
+            _refuse(f"more than {limits.YAML_VALUES} values", event)
+
+
+class _Loader(_SafeLoader):  # type: ignore[misc]
+    """PyYAML's safe loader, stricter: keys are words and differ, scalars are those of YAML 1.2."""
 
     # PyYAML's own names, filled below.
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
     yaml_constructors: ClassVar[dict[Any, Any]] = {
         tag: construct
-        for tag, construct in SafeConstructor.yaml_constructors.items()
+        for tag, construct in yaml.SafeLoader.yaml_constructors.items()
         if tag is None or tag.rpartition(":")[2] in ("map", "seq", "str")
     }
 
-    def __init__(self, stream: str):
-        _Parser.__init__(self, stream)
-        Composer.__init__(self)
-        SafeConstructor.__init__(self)
-        Resolver.__init__(self)
-        self._depth = self._nodes = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            self._refuse("aliases (*name) are not supported", self.peek_event())
-        if self._depth == limits.DEPTH:
-            self._refuse(f"nested deeper than {limits.DEPTH} levels", self.peek_event())
-        if self._nodes == limits.YAML_VALUES:
-            self._refuse(f"more than {limits.YAML_VALUES} values", self.peek_event())
-        self._nodes += 1
-        self._depth += 1
-        node = Composer.compose_node(self, parent, index)
-        self._depth -= 1
-        return node
-
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         if not isinstance(node, yaml.MappingNode):
-            self._refuse("expected a mapping", node)
+            _refuse("expected a mapping", node)
         mapping: dict[Hashable, Any] = {}
         for key_node, value_node in node.value:
             key = self.construct_object(key_node, deep=True)
             if not isinstance(key, str):
-                self._refuse(f"the key {key!r} must be a word", key_node)
+                _refuse(f"the key {key!r} must be a word", key_node)
             if key in mapping:
-                self._refuse(f"duplicate key {key!r}", key_node)
+                _refuse(f"duplicate key {key!r}", key_node)
             mapping[key] = self.construct_object(value_node, deep=deep)
         return mapping
 
-    def _refuse(self, problem: str, at: Any) -> NoReturn:
-        raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
+
+def _refuse(problem: str, at: Any) -> NoReturn:
+    raise yaml.constructor.ConstructorError(None, None, problem, at.start_mark)
 
 
 _TAG = "tag:yaml.org,2002:"
@@ -212,29 +193,23 @@ _FLOAT = r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
 _SPECIAL_FLOAT = r"[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN|Nan)$"
 
 
-def _scalar(construct: Callable[[str], Any]) -> Callable[[_Loader, Any], Any]:
-    return lambda loader, node: construct(loader.construct_scalar(node))
-
-
 def _to_float(text: str) -> float:
     return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
 
 
 # The scalars of YAML 1.2: name, pattern, the characters it may start with, and what it makes.
-for _name, _pattern, _first, _construct in (
+_SCALARS: list[tuple[str, str, list[str], Callable[[str], Any]]] = [
     ("null", r"(~|null|Null|NULL|)$", ["~", "n", "N", ""], lambda text: None),
-    (
-        "bool",
-        r"(true|True|TRUE|false|False|FALSE)$",
-        list("tTfF"),
-        lambda text: text[:1] in ("t", "T"),
-    ),
+    ("bool", r"(true|True|TRUE|false|False|FALSE)$", list("tTfF"), lambda t: t[0] in "tT"),
     ("int", r"[-+]?[0-9]+$", list("-+0123456789"), int),
     ("float", f"{_FLOAT}|{_SPECIAL_FLOAT}", list("-+.0123456789"), _to_float),
-):
+]
+for _name, _pattern, _first, _make in _SCALARS:
     _Loader.add_implicit_resolver(_TAG + _name, re.compile(_pattern), _first)
-    _Loader.yaml_constructors[_TAG + _name] = _scalar(_construct)
+    _Loader.add_constructor(
+        _TAG + _name, lambda loader, node, make=_make: make(loader.construct_scalar(node))
+    )
 for _name in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.yaml_constructors[_TAG + _name] = lambda loader, node: loader.construct_mapping(
-        node, deep=True
+    _Loader.add_constructor(
+        _TAG + _name, lambda loader, node: loader.construct_mapping(node, deep=True)
     )

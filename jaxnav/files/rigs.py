@@ -25,29 +25,23 @@ file may have a provenance (`calibrated`, see `jaxnav.files.provenance`).
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field, field_validator, model_validator
 
-from jaxnav.core.models.camera import LENS_COEFFICIENTS
-from jaxnav.core.models.rig import CameraRig, Timing
+from jaxnav.core.models.camera import LENS_COEFFICIENTS, Camera
+from jaxnav.core.models.lenses import LENSES
+from jaxnav.core.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Timing
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
-from jaxnav.files import kalibr, poses
-from jaxnav.files.figures import (
-    CameraFigures,
-    Lens,
-    coefficients_problem,
-    figures_of_rig,
-    rig_from_figures,
-)
+from jaxnav.files import poses
 from jaxnav.files.provenance import Calibrated
-from jaxnav.files.ranges import pinhole_problem, within
-from jaxnav.files.reading import read_mapping
+from jaxnav.files.ranges import Range, pinhole_problem, within
 from jaxnav.files.validation import (
     NAME_PATTERN,
     AngleDeg,
@@ -62,11 +56,19 @@ from jaxnav.files.validation import (
     Positive,
     PositivePair,
     QuaternionPose,
-    at,
-    validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
 
+Lens = Literal[
+    "none",
+    "radtan",
+    "rational",
+    "thin_prism",
+    "equidistant",
+    "omni",
+    "double_sphere",
+    "eucm",
+]
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
 _MOST_SIGMA_M, *_, _MOST_SIGMA_RAD = TUNABLES["rig.extrinsics_sigma"].most
 _MOST_SIGMA_DEG = round(math.degrees(_MOST_SIGMA_RAD), 9)
@@ -92,13 +94,21 @@ class CameraSigma(Entry):
             raise ValueError(f"{missing} is missing: it goes with the other sigma of a place")
         return self
 
-    def of_place(self) -> Float[np.ndarray, " 6"] | None:
-        """Sigmas of the place, m, and of the direction, rad; None where they are not given."""
+    @staticmethod
+    def from_place(sigma: Float[np.ndarray, " 6"]) -> "CameraSigma":
+        """Those of a place, m, and of a direction, rad."""
+        turn_deg = np.minimum(np.rad2deg(sigma[3:]), _MOST_SIGMA_DEG)  # once rounded
+        return CameraSigma.model_construct(
+            position_m=sigma[:3].tolist(), rotation_deg=turn_deg.tolist()
+        )
+
+    def place(self) -> Float[np.ndarray, " 6"]:
+        """Sigmas of the place, m, and of the direction, rad; measured by hand if not given."""
         if self.position_m is None or self.rotation_deg is None:
-            return None
+            return PLACED_BY_HAND
         return np.concatenate([self.position_m, np.deg2rad(self.rotation_deg)])
 
-    def of_lens(self) -> Float[np.ndarray, " 4"] | None:
+    def lens_px(self) -> Float[np.ndarray, " 4"] | None:
         """Sigmas of fx, fy, cx, cy, px; None where they are not given."""
         if self.focal_px is None or self.center_px is None:
             return None
@@ -106,7 +116,11 @@ class CameraSigma(Entry):
 
 
 class CameraEntry(Entry):
-    """One camera of a rig file."""
+    """One camera of a rig file, and of every other tool's file once it is read.
+
+    Its numbers are float64, whatever JAX's precision is: so what two formats hold goes from one to
+    the other bit for bit.
+    """
 
     name: Name
     lens: Lens
@@ -160,29 +174,77 @@ class CameraEntry(Entry):
             raise ValueError(f"focal_px, center_px, image_size_px: {problem}")
         return self
 
-    def figures(self) -> CameraFigures:
-        """The camera's figures, with the numbers of the file."""
-        if self.T_camera_vehicle is not None:
-            T_camera_vehicle = written_pose(self.T_camera_vehicle)
-        elif self.T_vehicle_camera is not None:
-            T_vehicle_camera = poses.pose_as_read(written_pose(self.T_vehicle_camera))
-            T_camera_vehicle = poses.inverse(T_vehicle_camera)
-        else:
-            assert self.position_m is not None  # _placed_once
+    @staticmethod
+    def create(
+        name: str,
+        lens: Lens,
+        pinhole_px: Sequence[float],
+        distortion: Sequence[float],
+        image_size_px: Sequence[int],
+        **more: Any,
+    ) -> "CameraEntry":
+        """A camera whose numbers have been checked already; it may have any name, and no place.
+
+        Args:
+            pinhole_px: fx fy cx cy.
+            distortion: missing last coefficients are zero.
+            more: other fields.
+        """
+        missing = [0.0] * (LENS_COEFFICIENTS[lens] - len(distortion))
+        return CameraEntry.model_construct(
+            name=name,
+            lens=lens,
+            focal_px=[float(value) for value in pinhole_px[:2]],
+            center_px=[float(value) for value in pinhole_px[2:]],
+            distortion=[*(float(value) for value in distortion), *missing],
+            image_size_px=[int(side) for side in image_size_px],
+            **more,
+        )
+
+    def placed(self) -> "CameraEntry":
+        """The same camera, with all coefficients, and with `T_camera_vehicle` for its place."""
+        T_camera_vehicle = self.T_camera_vehicle
+        if self.T_vehicle_camera is not None:
+            T_camera_vehicle = pose_entry(poses.inverse(poses.pose_as_read(self.T_vehicle_camera)))
+        elif self.position_m is not None:
             angles_deg = (self.yaw_deg or 0.0, self.elevation_deg or 0.0, self.roll_deg or 0.0)
             T_camera_vehicle = place(self.position_m, angles_deg)
-        sigma = self.sigma or CameraSigma()
-        return CameraFigures.create(
+        return CameraEntry.create(
             self.name,
             self.lens,
             [*self.focal_px, *self.center_px],
             self.distortion,
             self.image_size_px,
-            T_camera_vehicle,
-            sigma.of_place(),
-            sigma.of_lens(),
-            Timing(self.exposure_s, self.row_time_s),
+            T_camera_vehicle=T_camera_vehicle,
+            sigma=self.sigma,
+            **self.timing._asdict(),
         )
+
+    def camera(self) -> Camera:
+        """The camera without its place, in the process's precision."""
+        return Camera.create(self.focal_px, self.center_px, self.lens, self.distortion)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of its images."""
+        width, height = self.image_size_px
+        return width, height
+
+    @property
+    def timing(self) -> Timing:
+        """When its sensor sees."""
+        return Timing(self.exposure_s, self.row_time_s)
+
+
+def coefficients_problem(lens: str, coefficients: Sequence[float]) -> str | None:
+    """What is wrong with a lens's coefficients, in its order; None where nothing is."""
+    kind = LENSES[lens]
+    for name, value in zip(kind.coefficients, coefficients, strict=False):
+        least, most = kind.within.get(name, (-math.inf, math.inf))
+        if not Range(least, most, "", name).holds(value):
+            allowed = f"from {least:g} to {most:g}" if most < math.inf else f"at least {least:g}"
+            return f"{name} of the lens {lens} must be {allowed}, got {value:g}"
+    return None
 
 
 class RigFile(Entry):
@@ -202,33 +264,23 @@ class RigFile(Entry):
 
     def rig(self) -> CameraRig:
         """The rig, in the process's precision."""
-        return rig_from_figures([entry.figures() for entry in self.cameras])
+        return rig_of([entry.placed() for entry in self.cameras])
 
 
-def load_rig(path: str | Path) -> CameraRig:
-    """Read a camera rig from jaxnav's own YAML, or a Kalibr camchain with imu := vehicle.
-
-    Raises:
-        BadInput: one line naming file and key.
-    """
-    path = Path(path)
-    data = read_mapping(path)
-    if "cameras" in data:
-        return validate(RigFile, data, path).rig()
-    if kalibr.is_camchain(data):
-        chain = kalibr.camchain(path, data)
-        cameras = kalibr.camchain_figures(chain)
-        for camera in cameras:
-            if camera.T_camera_vehicle is None:
-                problem = "missing: where is this camera on the vehicle (imu := vehicle)?"
-                raise BadInput(at(path, camera.name, "T_cam_imu"), problem)
-        return rig_from_figures(
-            [
-                replace(camera, name=entry.tagtopic or camera.name)
-                for camera, entry in zip(cameras, chain.values(), strict=True)
-            ]
-        )
-    raise BadInput(path, "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)")
+def rig_of(cameras: Sequence[CameraEntry]) -> CameraRig:
+    """The rig of cameras that all have `T_camera_vehicle`, in the process's precision."""
+    sigmas = np.stack([(camera.sigma or CameraSigma()).place() for camera in cameras])
+    timings = [camera.timing for camera in cameras]
+    Ts = [poses.pose_as_read(camera.T_camera_vehicle) for camera in cameras]
+    return CameraRig.create(
+        [camera.camera() for camera in cameras],
+        [jaxlie.SE3(jnp.asarray(T, float)) for T in Ts],
+        [camera.name for camera in cameras],
+        [camera.size_px for camera in cameras],
+        # Degrees and radians give back the same numbers where these are float32's.
+        np.asarray(sigmas, np.float32).astype(float) if sigmas.any() else None,
+        timings if any(timing != UNKNOWN_TIMING for timing in timings) else None,
+    )
 
 
 def save_rig(
@@ -268,34 +320,33 @@ def with_provenance(data: dict[str, Any], calibrated: Calibrated | None) -> dict
 
 def rig_data(rig: CameraRig) -> dict[str, Any]:
     """The content of a rig's file in plain values, all numbers bit for bit; see `RigFile`."""
-    return camera_data(figures_of_rig(rig))
-
-
-def camera_data(cameras: Sequence[CameraFigures]) -> dict[str, Any]:
-    """The content of these cameras' rig file in plain values; every camera must have a place."""
-    entries: list[dict[str, Any]] = []
-    for camera in cameras:
-        assert camera.T_camera_vehicle is not None
+    entries = []
+    for index, name in enumerate(rig.names):
+        camera = rig.camera(index)
+        lens: Any = rig.cameras.lenses[int(camera.lens_index)]
+        T_camera_vehicle = np.asarray(rig.Ts_camera_vehicle.wxyz_xyz[index], float)
+        known = rig.extrinsics_sigma
+        sigma = np.zeros(6) if known is None else np.asarray(known[index], float)
         entries.append(
-            {
-                "name": camera.name,
-                "lens": camera.lens,
-                "focal_px": list(camera.focal_px),
-                "center_px": list(camera.center_px),
-                "distortion": list(camera.distortion),
-                "image_size_px": list(camera.image_size_px),
-                "T_camera_vehicle": plain_pose(camera.T_camera_vehicle),
-            }
+            CameraEntry.create(
+                name,
+                lens,
+                np.concatenate([camera.focal_px, camera.center_px]).tolist(),
+                np.asarray(camera.distortion)[: LENS_COEFFICIENTS[lens]].tolist(),
+                rig.image_sizes_px[index],
+                T_camera_vehicle=pose_entry(T_camera_vehicle),
+                sigma=CameraSigma.from_place(sigma),
+                **rig.timing(index)._asdict(),
+            )
         )
-        entries[-1] |= {k: v for k, v in camera.timing._asdict().items() if v is not None}
-        if camera.sigma is not None:
-            turn_deg = np.minimum(np.rad2deg(camera.sigma[3:]), _MOST_SIGMA_DEG)  # once rounded
-            place = {"position_m": camera.sigma[:3], "rotation_deg": turn_deg}
-            entries[-1]["sigma"] = {name: sigma.tolist() for name, sigma in place.items()}
-    return {"cameras": entries}
+    return _file_data(entries)
 
 
-def rig_text(cameras: Sequence[CameraFigures]) -> str:
+def _file_data(cameras: Sequence[CameraEntry]) -> dict[str, Any]:
+    return {"cameras": [camera.model_dump(exclude_none=True) for camera in cameras]}
+
+
+def rig_text(cameras: Sequence[CameraEntry]) -> str:
     """The cameras as the text of a rig file.
 
     Raises:
@@ -310,11 +361,11 @@ def rig_text(cameras: Sequence[CameraFigures]) -> str:
             raise BadInput(where, problem)
         if not re.match(NAME_PATTERN, camera.name):
             raise BadInput(where, "can't be a camera's name (a letter first): give --camera-name")
-    return yaml_text(camera_data(cameras))
+    return yaml_text(_file_data(cameras))
 
 
 def rig_left_out(file: RigFile) -> list[str]:
-    """The names of the entries of a rig file that `CameraFigures` don't hold."""
+    """The names of the entries of a rig file that other formats don't hold."""
     left_out = ["calibrated"] if file.calibrated else []
     of_lens = {"focal_px", "center_px", "distortion"}
     for entry in file.cameras:
@@ -323,31 +374,17 @@ def rig_left_out(file: RigFile) -> list[str]:
     return left_out
 
 
-def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> Float[np.ndarray, " 7"]:
-    """The pose T_camera_vehicle, (7,) wxyz_xyz, of a camera by its position and direction.
+def place(position_m: Sequence[float], angles_deg: Sequence[float]) -> QuaternionPose:
+    """The pose T_camera_vehicle of a camera by its position and direction.
 
     Args:
         position_m: of the camera in the vehicle.
         angles_deg: yaw, elevation and roll, see `poses.rotation_towards`.
     """
     T_vehicle_camera = poses.transform(poses.rotation_towards(*angles_deg), position_m)
-    return poses.inverse(poses.pose_from_matrix(T_vehicle_camera))
+    return pose_entry(poses.inverse(poses.pose_from_matrix(T_vehicle_camera)))
 
 
-def written_pose(
-    pose: QuaternionPose | Sequence[Sequence[float]],
-) -> Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"]:
-    """A pose as it is written, with the numbers of the file: (7,) wxyz_xyz or (4, 4)."""
-    if isinstance(pose, QuaternionPose):
-        return np.array([*pose.wxyz, *pose.xyz_m], float)
-    return np.array(pose, float)
-
-
-def plain_pose(
-    written: Float[np.ndarray, " 7"] | Float[np.ndarray, "4 4"],
-) -> dict[str, list[float]] | list[list[float]]:
-    """A pose in the plain values that we write."""
-    if written.shape == (4, 4):
-        rows: list[list[float]] = written.tolist()
-        return rows
-    return {"wxyz": written[:4].tolist(), "xyz_m": written[4:].tolist()}
+def pose_entry(pose: Float[np.ndarray, " 7"]) -> QuaternionPose:
+    """A pose (7,) wxyz_xyz as files hold it."""
+    return QuaternionPose.model_construct(wxyz=pose[:4].tolist(), xyz_m=pose[4:].tolist())

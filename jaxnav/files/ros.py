@@ -35,7 +35,6 @@ from pydantic import Field, model_validator
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
-from jaxnav.files.rigs import written_pose
 from jaxnav.files.topics import OdometrySigma, TopicMap, read_topics
 from jaxnav.files.validation import (
     Entry,
@@ -139,7 +138,7 @@ class RosFile(TopicMap):
     @property
     def T_vehicle_sensor(self) -> Float[np.ndarray, " 7"]:
         """Where the body of a free rig's odometry is on it, (7,) wxyz xyz."""
-        return poses.pose_as_read(written_pose(self.T_vehicle_odometry))
+        return poses.pose_as_read(self.T_vehicle_odometry)
 
     def with_markers(self, path: str) -> "RosFile":
         """The same with another marker file, whose path counts from this file's folder."""

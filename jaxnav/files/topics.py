@@ -31,8 +31,6 @@ from jaxnav.core.models.vehicle import (
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
-from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import written_pose
 from jaxnav.files.validation import (
     CornerSigma,
     Entry,
@@ -41,12 +39,12 @@ from jaxnav.files.validation import (
     NonNegative,
     Number,
     Positive,
-    validate,
+    read,
 )
 
 
 class JointsEntry(Entry):
-    """The joints of a sensor_msgs/JointState that tell speed and steering."""
+    """The joints of a sensor_msgs/JointState that give speed and steering."""
 
     driven: Annotated[list[Name], Field(min_length=1, max_length=16)]
     steered: Annotated[list[Name], Field(min_length=1, max_length=16)]
@@ -92,7 +90,7 @@ class ImuEntry(Entry):
         gyroscope_noise_density: rad/s/sqrt(Hz); the accelerometer's m/s^2/sqrt(Hz).
         gyroscope_random_walk: rad/s^2/sqrt(Hz); the accelerometer's m/s^3/sqrt(Hz).
         gyroscope_bias_sigma: rad/s; the accelerometer's m/s^2.
-        update_rate: Hz; not looked at, as the stamps tell it.
+        update_rate: Hz; not looked at, as the stamps say it.
         imu_delay_s: its samples were taken so long before their stamps, on the cameras' clock.
         max_gyro_radps, max_accel_mps2: its range, beyond which a reading is saturated.
         level: the map's z points up within two degrees; else gravity is found on the way.
@@ -139,7 +137,7 @@ class ImuEntry(Entry):
 
     def T_matrix(self) -> Float[np.ndarray, "4 4"]:
         """T_vehicle_imu, (4, 4)."""
-        return poses.matrix(poses.pose_as_read(written_pose(self.T_vehicle_imu)))
+        return poses.matrix(poses.pose_as_read(self.T_vehicle_imu))
 
 
 class TopicMap(Entry):
@@ -149,7 +147,7 @@ class TopicMap(Entry):
         cameras: name in the rig -> topic of detections or of images.
         odometry: the topic; None where the bag has none.
         joints: of a topic of JointState.
-        imu: of a rig that moves freely, or of a vehicle whose file has a gyro, which then tells its
+        imu: of a rig that moves freely, or of a vehicle whose file has a gyro, which then gives its
             turn rate; None where there is none.
         corner_sigma_px: standard deviation of a detected corner along one axis.
         first_corner: the corner, as the marker map sees the marker, that a detection begins with;
@@ -206,6 +204,6 @@ def load_topics(path: str | Path) -> TopicMap:
 
 def read_topics(kind: type[Topics], path: Path) -> Topics:
     """Read a topic map, or a file that holds more than one; see `load_topics`."""
-    topics = validate(kind, read_mapping(path), path)
+    topics = read(path, kind)
     topics._path = path
     return topics

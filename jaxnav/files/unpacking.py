@@ -1,7 +1,8 @@
 """Decompression with a bound on the bytes that come out, checked as they come."""
 
 import bz2
-from collections.abc import Callable, Iterator
+import io
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ class Budget:
     left: int
 
     @staticmethod
-    def of_file(path: Path) -> "Budget":
+    def from_file(path: Path) -> "Budget":
         """The budget by a file's size; a file that compresses far better is no recording."""
         packed = 0
         with suppress(OSError):
@@ -52,22 +53,14 @@ def unpack_chunk(kind: str, data: bytes, budget: Budget, most: int = limits.CHUN
         ValueError: it unpacks to more than `most`, or than the budget.
         Exception: any that the bytes lead to in a decompressor.
     """
-    if kind in ("", "none"):
-        pieces = iter([data])
-    elif kind == "zstd":
-        pieces = zstd_pieces(data)
-    else:
-        pieces = _framed(
-            {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}[kind], data
-        )
-    parts, count = [], 0
-    for piece in pieces:
-        count += len(piece)
-        if count > most:
-            raise ValueError(f"a chunk that is larger than it says, or than {most} bytes")
+    openers = {"bz2": bz2.BZ2File, "lz4": lz4.frame.LZ4FrameFile, "zstd": _zstd_stream}
+    unpacked = bytearray()
+    for piece in _pieces(openers.get(kind, lambda packed: packed)(io.BytesIO(data))):
         budget.take(len(piece))
-        parts.append(piece)
-    return b"".join(parts)
+        unpacked += piece
+        if len(unpacked) > most:
+            raise ValueError(f"a chunk that is larger than it says, or than {most} bytes")
+    return bytes(unpacked)
 
 
 def copy_bz2(source: Path, target: IO[bytes], budget: Budget) -> None:
@@ -78,35 +71,28 @@ def copy_bz2(source: Path, target: IO[bytes], budget: Budget) -> None:
         OSError, EOFError: it is damaged, or the disk is full.
     """
     with bz2.open(source) as stream:
-        while piece := stream.read(_PIECE):
+        for piece in _pieces(stream):
             budget.take(len(piece))
             target.write(piece)
 
 
-def zstd_pieces(data: bytes | IO[bytes]) -> Iterator[bytes]:
+def zstd_pieces(packed: IO[bytes]) -> Iterator[bytes]:
     """The content of zstd's frames in pieces, one frame after the other.
 
     Raises:
         zstandard.ZstdError: a frame is damaged.
     """
+    return _pieces(_zstd_stream(packed))
+
+
+def _zstd_stream(packed: IO[bytes]) -> Any:
     # A frame declares the size of its window itself: no more than a chunk is allowed.
     window = 2 ** (limits.CHUNK_BYTES.bit_length() - 1)
-    reader = zstandard.ZstdDecompressor(max_window_size=window).stream_reader(
-        data, read_across_frames=True
+    return zstandard.ZstdDecompressor(max_window_size=window).stream_reader(
+        packed, read_across_frames=True
     )
-    while piece := reader.read(_PIECE):
-        yield piece
 
 
-def _framed(make: Callable[[], Any], data: bytes) -> Iterator[bytes]:
-    """The content of concatenated streams, in pieces of at most `_PIECE` bytes."""
-    while data:
-        stream = make()
-        piece = stream.decompress(data, _PIECE)
+def _pieces(stream: Any) -> Iterator[bytes]:
+    while piece := stream.read(_PIECE):
         yield piece
-        while not stream.eof:
-            if stream.needs_input:
-                raise EOFError("a chunk ends too early")
-            piece = stream.decompress(b"", _PIECE)
-            yield piece
-        data = stream.unused_data or b""

@@ -4,6 +4,7 @@ Files are validated by frozen pydantic models. `validate` turns the first error 
 one line with the file and the key: `rig.yaml: cameras.front.focal_px[0]: must be > 0, got 0`.
 """
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -20,6 +21,7 @@ from pydantic import (
 from jaxnav.errors import BadInput
 from jaxnav.files.poses import check_matrix, check_quaternion
 from jaxnav.files.ranges import RANGES, placed_within, within
+from jaxnav.files.reading import read_mapping
 
 
 class Entry(BaseModel):
@@ -125,6 +127,15 @@ def validate(model: type[Model], data: Any, path: Path, prefix: str = "") -> Mod
     raise BadInput(at(path, prefix, _key(first["loc"], data)), problem)
 
 
+def read(path: str | Path, model: type[Model]) -> Model:
+    """Read the mapping in a YAML or JSON file as a model.
+
+    Raises:
+        BadInput: one line naming file and key.
+    """
+    return validate(model, read_mapping(Path(path)), Path(path))
+
+
 def at(path: Path, *keys: str) -> str:
     """File and keys as `file: key.key[0]`, without keys that are empty."""
     dotted = "".join(key if key.startswith("[") else f".{key}" for key in keys if key)
@@ -195,6 +206,23 @@ _BOUNDS = {
     "less_than": ("<", "lt"),
     "less_than_equal": ("<=", "le"),
 }
+
+
+def unread_keys(data: Mapping[str, Any], known: Iterable[str], prefix: str = "") -> list[str]:
+    """The keys of a file, except the known ones, whose values are not empty, zero or false."""
+    unread = []
+    for key, value in data.items():
+        if key not in known and _says_something(value):
+            count = f" ({len(value)} entries)" if isinstance(value, list) else ""
+            unread.append(f"{prefix}{key if key.isprintable() else ascii(key)}{count}")
+    return unread
+
+
+def _says_something(value: Any, levels: int = 8) -> bool:
+    inner = list(value.values()) if isinstance(value, Mapping) else value
+    if isinstance(inner, list) and levels:
+        return any(_says_something(item, levels - 1) for item in inner)
+    return bool(inner)
 
 
 def show_value(value: Any) -> str:

@@ -50,6 +50,7 @@ from jaxnav.files.validation import (
     Position,
     Positive,
     Radius,
+    read,
     validate,
 )
 from jaxnav.files.writing import atomic_write, yaml_text
@@ -89,8 +90,8 @@ class VehicleFile(Entry):
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
         figures = self.model_dump(exclude={*_NO_FIGURES}, exclude_none=True)
-        told = zip(SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA, strict=True)
-        sigma = np.asarray([self.sigma.get(name, default) for name, default in told])
+        defaults = zip(SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA, strict=True)
+        sigma = np.asarray([self.sigma.get(name, default) for name, default in defaults])
         gyro = None if self.gyro is None else self.gyro.gyro()
         return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None, gyro=gyro)
 
@@ -157,11 +158,7 @@ def load_vehicle(path: str | Path) -> Vehicle | TwistBase:
     Raises:
         BadInput: one line naming file and key.
     """
-    path = Path(path)
-    data = read_mapping(path)
-    if is_base_file(data):
-        return validate(BaseFile, data, path).vehicle()
-    return validate(VehicleFile, data, path).vehicle()
+    return _read(Path(path)).vehicle()
 
 
 def may_resume(path: Path) -> bool:
@@ -170,15 +167,19 @@ def may_resume(path: Path) -> bool:
     Raises:
         BadInput: as `load_vehicle`.
     """
-    data = read_mapping(path)
-    if is_base_file(data):
-        return validate(BaseFile, data, path).resume
-    return validate(VehicleFile, data, path).resume
+    return _read(path).resume
 
 
 def is_base_file(data: Mapping[str, Any]) -> bool:
     """Whether this is a vehicle file of a base that is no car."""
     return bool(data.get("base", ACKERMANN) != ACKERMANN)
+
+
+def _read(path: Path) -> VehicleFile | BaseFile:
+    data = read_mapping(path)
+    if is_base_file(data):
+        return validate(BaseFile, data, path)
+    return validate(VehicleFile, data, path)
 
 
 def load_car(path: str | Path) -> Vehicle:
@@ -218,13 +219,10 @@ def vehicle_data(vehicle: Vehicle | TwistBase) -> dict[str, Any]:
     # Without corrections that correct nothing, any version of the program reads the file.
     written: dict[str, Any] = {n: value for n, value in data.items() if _FIGURES[n] != value}
     sigma = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma, float)
-    if not np.array_equal(sigma, DEFAULT_SENSOR_SIGMA.astype(_dtype(vehicle))):
+    dtype = np.asarray(vehicle.wheelbase_m).dtype
+    if not np.array_equal(sigma, DEFAULT_SENSOR_SIGMA.astype(dtype)):
         written["sigma"] = dict(zip(SENSOR_ERRORS, sigma.tolist(), strict=True))
     return written | gyro_data(vehicle.gyro)
-
-
-def _dtype(vehicle: Vehicle) -> np.dtype[Any]:
-    return np.asarray(vehicle.wheelbase_m).dtype
 
 
 def save_vehicle(
@@ -264,8 +262,7 @@ def load_route(path: str | Path) -> Route:
     Raises:
         BadInput: one line naming file and key.
     """
-    path = Path(path)
-    entry = validate(RouteFile, read_mapping(path), path)
+    entry = read(path, RouteFile)
     return Route(
         waypoints_m=tuple((x, y) for x, y in entry.waypoints_m),
         waypoint_radius_m=entry.waypoint_radius_m,

@@ -21,15 +21,18 @@ from jaxnav.core.models.conventions import APRILTAG_FAMILIES, WXYZ_TAG_MARKER
 from jaxnav.core.models.markers import CORNER_SIGNS, FAMILY_SIZES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import MarkerFigures, unread_keys
+from jaxnav.files.markers import MarkerEntry
 from jaxnav.files.ranges import within
+from jaxnav.files.rigs import pose_entry
 from jaxnav.files.validation import (
     Count,
     ForeignEntry,
     Number,
     Positive,
+    QuaternionPose,
     Vector,
     at,
+    unread_keys,
     validate,
 )
 
@@ -88,9 +91,9 @@ def is_layout(data: dict[str, Any]) -> bool:
     return "tags" in data
 
 
-def layout_figures(
+def layout_markers(
     path: Path, data: dict[str, Any], size_m: float = SIZE_M, family: str = FAMILY
-) -> list[MarkerFigures]:
+) -> list[MarkerEntry]:
     """The markers of a field layout.
 
     Args:
@@ -110,8 +113,12 @@ def layout_figures(
             raise BadInput(at(path, f"tags[{index}].ID"), problem)
         place, turn = tag.pose.translation, tag.pose.rotation.quaternion
         wxyz = poses.quaternion_product([turn.W, turn.X, turn.Y, turn.Z], WXYZ_TAG_MARKER)
-        T_world_marker = np.array([*wxyz, *place.xyz()])
-        markers.append(MarkerFigures(marker_id, family, size_m, T_world_marker))
+        pose = QuaternionPose.model_construct(wxyz=wxyz, xyz_m=place.xyz())
+        markers.append(
+            MarkerEntry.model_construct(
+                id=marker_id, family=family, size_m=size_m, T_world_marker=pose
+            )
+        )
     return markers
 
 
@@ -128,7 +135,7 @@ def layout_left_out(data: dict[str, Any]) -> list[str]:
     return unread
 
 
-def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, float]) -> str:
+def layout_text(markers: Sequence[MarkerEntry], field_size_m: tuple[float, float]) -> str:
     """The markers as the text of a field layout.
 
     Args:
@@ -157,7 +164,7 @@ def layout_text(markers: Sequence[MarkerFigures], field_size_m: tuple[float, flo
     return json.dumps(data, indent=2) + "\n"
 
 
-def extent_m(markers: Sequence[MarkerFigures]) -> tuple[float, float]:
+def extent_m(markers: Sequence[MarkerEntry]) -> tuple[float, float]:
     """The extent (along x, along y), m, of the smallest box around the origin and all corners."""
     corners = [np.zeros((1, 2))]
     for marker in markers:
@@ -168,11 +175,13 @@ def extent_m(markers: Sequence[MarkerFigures]) -> tuple[float, float]:
     return along_x, along_y
 
 
-def _tag(marker: MarkerFigures) -> dict[str, Any]:
+def _tag(marker: MarkerEntry) -> dict[str, Any]:
     written = marker.T_world_marker
-    pose = written if written.shape == (7,) else poses.pose_as_read(written)
+    if isinstance(written, list):
+        written = pose_entry(poses.pose_from_matrix(written))
+    assert written is not None  # a marker of a map is placed
     w, x, y, z = WXYZ_TAG_MARKER
-    W, X, Y, Z = poses.quaternion_product(pose[:4].tolist(), (w, -x, -y, -z))
-    place = dict(zip("xyz", pose[4:].tolist(), strict=True))
+    W, X, Y, Z = poses.quaternion_product(written.wxyz, (w, -x, -y, -z))
+    place = dict(zip("xyz", written.xyz_m, strict=True))
     rotation = {"quaternion": {"W": W, "X": X, "Y": Y, "Z": Z}}
     return {"ID": marker.id, "pose": {"translation": place, "rotation": rotation}}

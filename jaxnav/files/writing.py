@@ -1,10 +1,11 @@
 """Writing of files: written beside and then renamed, so that no reader ever sees half of one."""
 
-import hashlib
 import json
 import math
 import os
+import secrets
 import stat
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -15,7 +16,8 @@ import yaml
 from jaxtyping import Float
 
 from jaxnav.errors import BadInput
-from jaxnav.files.locking import create_temporary, naming_written, sweep
+
+_LEFT_S = 3600.0  # a temporary file of this age was left behind by a process that was killed
 
 
 @contextmanager
@@ -23,34 +25,51 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """A path beside `path`, with the same suffix, that becomes `path` when the block succeeds.
 
     When the block raises, nothing is left and an older file stays as it was; after a power cut
-    there is the older file or the new one. Files that killed processes have left are swept away.
-    An older file's permissions and owner stay; a link stays, and the file it leads to is written.
+    there is the older file or the new one. Files that killed processes left here an hour ago and
+    more are removed. An older file's permissions and owner stay; a link stays, and the file it
+    leads to is written.
 
     Raises:
         BadInput: the folder is missing or closed to writing, or `path` is a folder, a device or
             write-protected.
     """
-    with naming_written(path):
+    with _naming_written(path):
         target, older = _target(path)
-        word = hashlib.blake2b(os.fsencode(target.name), digest_size=4).hexdigest()
-        begin = f".jaxnav-{word}-"
-        sweep(map(str, target.parent.glob(f"{begin}*")))
         # While it is written, the file must not be open to more readers than the older one.
-        name, fd = create_temporary(
-            lambda unique: f"{target.parent}/{begin}{unique}{target.suffix}",
-            0o600 if older else 0o666,
-        )
-        beside = Path(name)
+        beside = temporary_file(target, 0o600 if older else 0o666)
         try:
             yield beside
-            if older is not None:
-                _take_over(fd, older)
-            os.fsync(fd)
+            fd = os.open(beside, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
+            try:
+                if older is not None and os.name == "posix":
+                    with suppress(PermissionError):  # only root gives files away
+                        os.fchown(fd, older.st_uid, older.st_gid)
+                    os.fchmod(fd, stat.S_IMODE(older.st_mode))
+                os.fsync(fd)
+            finally:
+                os.close(fd)
             os.replace(beside, target)  # noqa: PTH105  (said in the docstring by this name)
-            _remember(target.parent)
+            _sync_folder(target.parent)
         finally:
             beside.unlink(missing_ok=True)
-            os.close(fd)
+
+
+def temporary_file(target: Path, mode: int) -> Path:
+    """Make an empty file beside another one, with its suffix, and remove what was left there.
+
+    Args:
+        mode: its permissions, less those that the umask takes.
+
+    Raises:
+        OSError: it can't be made.
+    """
+    for left in target.parent.glob(f".jaxnav-{16 * '[0-9a-f]'}*"):
+        with suppress(OSError):
+            if left.is_file() and time.time() - left.lstat().st_mtime > _LEFT_S:
+                left.unlink()
+    beside = target.with_name(f".jaxnav-{secrets.token_hex(8)}{target.suffix}")
+    os.close(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
+    return beside
 
 
 def require_writable(path: str | Path) -> None:
@@ -59,11 +78,63 @@ def require_writable(path: str | Path) -> None:
     Raises:
         BadInput: the file can't be written.
     """
-    with naming_written(path):
-        target, _ = _target(path)
-        name, fd = create_temporary(lambda unique: f"{target.parent}/.jaxnav-{unique}", 0o600)
-        os.unlink(name)  # noqa: PTH108
+    with _naming_written(path):
+        temporary_file(_target(path)[0], 0o600).unlink()
+
+
+@contextmanager
+def sole_writer(path: str | Path) -> Iterator[None]:
+    """Keep all other processes out of such a block for the same path while this one runs.
+
+    The lock is a file beside it, `.NAME.lock`, which the system unlocks however its process ends.
+    Where the disk knows no locks there is none.
+
+    Raises:
+        BadInput: another process is in such a block, or the folder is missing or closed to writing.
+    """
+    path = Path(os.path.realpath(path))
+    beside = path.with_name(f".{path.name}.lock")
+    with _naming_written(path):
+        fd = _locked(beside)
+    if fd is None:
+        raise BadInput(path, "is being written by another process")
+    try:
+        yield
+    finally:
+        # While it is still locked: a process that opened it then finds that it is gone.
+        with suppress(OSError):  # Windows removes no open file, and an empty one does no harm
+            beside.unlink()
         os.close(fd)
+
+
+def _locked(path: Path) -> int | None:
+    """A descriptor of the file, locked by this process; None where another one has locked it."""
+    from filelock import lock_descriptor
+
+    while True:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)
+        try:
+            is_locked = lock_descriptor(fd, blocking=False)
+        except OSError:  # no locks on this disk
+            return fd
+        if not is_locked:
+            os.close(fd)
+            return None
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(fd), path.stat(follow_symlinks=False)):
+                return fd
+        # Between opening and locking, the process that had it has removed it.
+        os.close(fd)
+
+
+@contextmanager
+def _naming_written(path: str | Path) -> Iterator[None]:
+    """Turn the system's errors about a file that is written into `BadInput`."""
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise BadInput(path, f"can't be written: {reason}") from None
 
 
 def atomic_write(path: str | Path, content: str | bytes) -> None:
@@ -72,9 +143,8 @@ def atomic_write(path: str | Path, content: str | bytes) -> None:
     Raises:
         BadInput: it can't be written.
     """
-    raw = content.encode() if isinstance(content, str) else content
     with atomic_path(path) as beside:
-        beside.write_bytes(raw)
+        beside.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def atomic_write_all(contents: Mapping[Path, str]) -> None:
@@ -162,8 +232,10 @@ def write_tum(
     if Ts.shape != (*stamps_s.shape, 7) or stamps_s.ndim != 1:
         raise ValueError(f"(F,) and (F, 7) expected, got {stamps_s.shape} and {Ts.shape}")
     lines = [
-        f"{stamp:.9f} {_metres(x)} {_metres(y)} {_metres(z)} {qx:.9g} {qy:.9g} {qz:.9g} {qw:.9g}\n"
-        for stamp, (qw, qx, qy, qz, x, y, z) in zip(stamps_s, Ts, strict=True)
+        # From 1000 m on 9 digits give less than a um.
+        f"{stamp:.9f} {' '.join(f'{m:.9g}' if abs(m) < 1e3 else f'{m:.6f}' for m in place_m)} "
+        f"{qx:.9g} {qy:.9g} {qz:.9g} {qw:.9g}\n"
+        for stamp, (qw, qx, qy, qz, *place_m) in zip(stamps_s, Ts, strict=True)
     ]
     atomic_write(path, "".join(lines))
 
@@ -186,13 +258,7 @@ def _target(path: str | Path) -> tuple[Path, os.stat_result | None]:
     return target, older
 
 
-def _take_over(fd: int, older: os.stat_result) -> None:
-    with suppress(PermissionError):  # only root gives files away
-        os.fchown(fd, older.st_uid, older.st_gid)
-    os.fchmod(fd, stat.S_IMODE(older.st_mode))
-
-
-def _remember(folder: Path) -> None:
+def _sync_folder(folder: Path) -> None:
     """Force the names in a folder to its disk, if it can do that, to survive a power cut."""
     with suppress(OSError):
         fd = os.open(folder, os.O_RDONLY)
@@ -211,30 +277,31 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
-def _metres(value: float) -> str:
-    """A length as text with 9 digits, or to the um from 1000 m on, where 9 digits give less."""
-    return f"{value:.9g}" if abs(value) < 1e3 else f"{value:.6f}"
-
-
 def yaml_text(data: dict[str, Any]) -> str:
     """Data as YAML, with each list of numbers on one line."""
-    return yaml.dump(data, Dumper=PlainDumper, sort_keys=False, default_flow_style=None, width=200)
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=200)
 
 
-class PlainDumper(yaml.SafeDumper):
+class _Dumper(yaml.SafeDumper):
     """A dumper without aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
-class Quoted(str):
-    """Text that is always written in quotes, so that no reader takes it for a number."""
+def _text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+    # A number of YAML 1.2, such as 1e-5 or 08, may be a word to PyYAML; it begins like a number.
+    style = None if text[:1].isalpha() else '"'
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
 
-PlainDumper.add_representer(
-    Quoted, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"')
-)
+def _list(dumper: _Dumper, entries: list[Any]) -> yaml.SequenceNode:
+    is_row = not any(isinstance(entry, list | dict) for entry in entries)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", entries, flow_style=is_row)
+
+
+_Dumper.add_representer(str, _text)
+_Dumper.add_representer(list, _list)
 
 
 def plain_data(value: Any) -> Any:

@@ -225,7 +225,7 @@ class McapMessages:
                 raise BadInput(self._path, problem) from None
 
     def _read(self, file: IO[bytes]) -> Iterator[Metadata | RecordedMessage]:
-        budget, opcode, is_over = Budget.of_file(self._path), 0, False
+        budget, opcode, is_over = Budget.from_file(self._path), 0, False
         while opcode != Opcode.FOOTER:
             crc = self._crc
             opcode, length = _RECORD.unpack(self._bytes(file, _RECORD.size))

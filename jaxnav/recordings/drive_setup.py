@@ -194,7 +194,7 @@ class DriveSetup:
             waypoint_radius_m=self.route.waypoint_radius_m,
             selector=make_selector(self.selector),
         )
-        return apply_params(navigator, Params.of(self.parameters, Path("DriveSetup")))
+        return apply_params(navigator, Params.from_values(self.parameters, Path("DriveSetup")))
 
     def pilot(self, folder: Path | None) -> Pilot:
         """A pilot at the beginning of a drive. All pilots of a setup share one compiled program.
@@ -264,7 +264,7 @@ class DriveSetup:
         )
         if not entry.parameters:
             return setup
-        return setup.with_params(Params.of(entry.parameters, where, prefix="header"))
+        return setup.with_params(Params.from_values(entry.parameters, where, prefix="header"))
 
 
 def needs_float64(header: dict[str, Any], where: Path) -> bool:

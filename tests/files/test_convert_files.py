@@ -12,9 +12,8 @@ import yaml
 
 from jaxnav import files
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
-from jaxnav.files.figures import CameraFigures
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import rig_text
+from jaxnav.files.rigs import CameraEntry, rig_text
 from tests.helpers.conversions import (
     HELD,
     KALIBR,
@@ -204,8 +203,13 @@ PROJECT: dict[str, Callable] = {
 def test_opencv_projects_with_the_numbers_of_the_file_to_our_pixels(tmp_path, to, lens):
     coefficients = [-0.21, 0.04, 0.003, -0.002, 0.01, 0.1, -0.02, 0.03, 2e-3, -1e-3, 3e-3, 5e-4]
     coefficients = coefficients[: LENS_COEFFICIENTS[lens]]
-    camera = CameraFigures.create(
-        "c", lens, [410.5, 409.0, 321.25, 239.5], coefficients, (640, 480), np.eye(4)
+    camera = CameraEntry.create(
+        "c",
+        lens,
+        [410.5, 409.0, 321.25, 239.5],
+        coefficients,
+        (640, 480),
+        T_camera_vehicle=np.eye(4).tolist(),
     )
     rig = written(tmp_path, "rig.yaml", rig_text([camera]))
     path = convert(rig, to, tmp_path / ("c.json" if to == "photonvision" else "c.yaml"))

@@ -264,15 +264,10 @@ def sigma_of(position_m: list[float], rotation_deg: list[float]) -> dict[str, An
 MIRROR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
 BAD_CAMERAS = [
     ({"focal_px": [0, 319]}, "cameras.front.focal_px[0]: must be > 0, got 0"),
-    ({"focal_px": [-3.0, 319]}, "cameras.front.focal_px[0]: must be > 0, got -3.0"),
     ({"focal_px": [1, float("nan")]}, "cameras.front.focal_px[1]: must be finite, got nan"),
-    ({"focal_px": [1, float("inf")]}, "cameras.front.focal_px[1]: must be finite, got inf"),
     ({"focal_px": [319]}, "cameras.front.focal_px: must have at least 2 entries, got 1"),
-    ({"focal_px": [1, 2, 3]}, "cameras.front.focal_px: must have at most 2 entries, got 3"),
     ({"focal_px": 319}, "cameras.front.focal_px: must be a list, got 319"),
     ({"focal_px": ["319", 319]}, "cameras.front.focal_px[0]: must be a number, got the text '319'"),
-    ({"focal_px": [True, 319]}, "cameras.front.focal_px[0]: must be a number, got True"),
-    ({"focal_px": None}, "cameras.front.focal_px: must be a list, got None"),
     ({"center_px": [1e300, 1]}, "cameras.front.center_px[0]: must be <= 1e+09, got 1e+300"),
     (
         {"lens": "fisheye"},
@@ -280,7 +275,6 @@ BAD_CAMERAS = [
     ),
     ({"distortion": [1, 2, 3]}, "cameras.front.distortion: must have 4 coefficients"),
     ({"lens": "radtan", "distortion": [1] * 3}, "front.distortion: must have 4 or 5 coefficients"),
-    ({"lens": "eucm", "distortion": [0.6]}, "front.distortion: must have 2 coefficients for the"),
     (
         {"lens": "double_sphere", "distortion": [0.1, 1.2]},
         "front.distortion: alpha of the lens double_sphere must be from 0 to 1, got 1.2",
@@ -289,16 +283,13 @@ BAD_CAMERAS = [
         {"lens": "omni", "distortion": [-0.1, 0, 0, 0, 0]},
         "front.distortion: xi of the lens omni must be at least 0, got -0.1",
     ),
-    ({"lens": "none", "distortion": [1]}, "front.distortion: must have 0 coefficients"),
     ({"image_size_px": [820.5, 410]}, "front.image_size_px[0]: must be a whole number, got 820.5"),
     ({"image_size_px": [820, 0]}, "cameras.front.image_size_px[1]: must be >= 1, got 0"),
     ({"focal": 3}, "cameras.front.focal: unknown key"),
-    ({"name": 3}, "cameras[0].name: must be text, got 3"),
     ({"name": "1 2"}, "cameras.1 2.name: must be a name"),
     ({"position_m": None}, "cameras.front: needs exactly one of T_vehicle_camera"),
     ({"T_camera_vehicle": np.eye(4).tolist()}, "got T_camera_vehicle and position_m"),
     ({"yaw_deg": None}, "cameras.front: position_m needs yaw_deg"),
-    ({"position_m": [1, 2]}, "cameras.front.position_m: must have at least 3 entries, got 2"),
     ({"position_m": None, "T_vehicle_camera": MIRROR}, "T_vehicle_camera: the 3x3 part has det(R)"),
     (
         {"position_m": None, "T_vehicle_camera": np.diag([1, 1, 1.01, 1]).tolist()},
@@ -318,13 +309,7 @@ BAD_CAMERAS = [
     ),
     (sigma_of([-0.01, 0, 0], [0] * 3), "front.sigma.position_m[0]: must be >= 0, got -0.01"),
     (sigma_of([0, 0.51, 0], [0] * 3), "front.sigma.position_m[1]: must be <= 0.5, got 0.51"),
-    (sigma_of([0] * 3, [0, 0, -1]), "front.sigma.rotation_deg[2]: must be >= 0, got -1"),
-    (sigma_of([0] * 3, [0, 15.1, 0]), "front.sigma.rotation_deg[1]: must be <= 15, got 15.1"),
-    (sigma_of([0] * 3, [0, float("nan"), 0]), "front.sigma.rotation_deg[1]: must be finite"),
-    (sigma_of([0] * 3, [0] * 2), "sigma.rotation_deg: must have at least 3 entries, got 2"),
-    (sigma_of([0] * 4, [0] * 3), "sigma.position_m: must have at most 3 entries, got 4"),
     ({"sigma": {"position_m": [0.01] * 3}}, "front.sigma: rotation_deg is missing: it goes with"),
-    ({"sigma": {"rotation_deg": [0.5] * 3}}, "front.sigma: position_m is missing: it goes with"),
 ]
 
 
@@ -344,16 +329,13 @@ def test_a_bad_camera_is_named_with_its_key(tmp_path, change, expected):
     ("text", "expected"),
     [
         ("", "the file is empty"),
-        ("# nothing\n", "the file is empty"),
         ("[1, 2]", "must be a mapping of keys to values, got a list"),
         ("cameras: []", "cameras: must have at least 1 entries, got 0"),
-        ("cameras: 3", "cameras: must be a list, got 3"),
         ("cameras: [3]", "cameras[0]: must be a mapping, got 3"),
         ("cameras:\ncameras:", "line 2: duplicate key 'cameras'"),
         ("cameras: &a [1]\nb: *a", "aliases (*name) are not supported"),
         ("a: " + "[" * 60, "nested deeper than 24 levels"),
         ("a: !!python/object/apply:os.system ['true']", "is not valid YAML"),
-        ("a: !!int four", "is not valid YAML"),
         ("a: [1, 2", "is not valid YAML: line 1"),
         ("a: \x01", "is not valid YAML"),
         ("1: 2", "the key 1 must be a word"),
@@ -399,15 +381,12 @@ BAD_MARKERS = [
     ({"corners_world_m": np.c_[_SQUARE[:, :2], [0.3, 0, 0.3, 0]].tolist()},
      "corners_world_m: TL TR BR BL must be a square"),
     ({"corners_world_m": (_SQUARE * [1.1, 0.9, 1]).tolist()}, "TL TR BR BL must be a square"),
-    ({"corners_world_m": _SQUARE[:3].tolist()}, "corners_world_m: must have at least 4 entries"),
     ({"corners_world_m": _SQUARE[:, :2].tolist()}, "corners_world_m[0]: must have at least 3"),
     ({"corners_world_m": None}, "markers[0]: needs exactly one of corners_world_m, T_world_marker"),
     ({"T_world_marker": np.eye(4).tolist()}, "markers[0]: needs exactly one of"),
     ({"family": "tag37h11"}, "markers[0].family: unknown 'tag37h11': expected one of tag16h5,"),
     ({"id": 587}, "markers[0].id: tag36h11 has ids 0 to 586, got 587"),
-    ({"id": -1}, "markers[0].id: must be >= 0, got -1"),
     ({"id": "7"}, "markers[0].id: must be a whole number, got the text '7'"),
-    ({"size_m": 0.0}, "markers[0].size_m: must be > 0, got 0.0"),
 ]  # fmt: skip
 
 
@@ -435,9 +414,7 @@ def test_a_marker_stands_once_in_a_map(tmp_path):
         ("vehicle.yaml", "wheelbase_m:", "wheelbase:", "(and 1 more)"),
         ("vehicle.yaml", "steering_limit_rad: 0.5", "steering_limit_rad: 30", "must be < 1.5708"),
         ("route.yaml", "[[1.30, 0.0], [0.50, 0.65]]", "[]", "waypoints_m: must have at least 1"),
-        ("route.yaml", "[1.30, 0.0]", "[1.30]", "waypoints_m[0]: must have at least 2 entries"),
         ("route.yaml", "psi_deg: 125.0", "psi: 2", "start.psi_deg: missing"),
-        ("route.yaml", "waypoint_radius_m: 0.15", "waypoint_radius_m: -1", "must be > 0, got -1"),
     ],
 )
 def test_a_bad_vehicle_or_route_is_named_with_its_key(tmp_path, loader, old, new, expected):
@@ -526,7 +503,6 @@ def test_a_camchain_may_have_lenses_beside_the_pinhole(tmp_path):
             "distortion_model: radtan\n  camera_model: ds",
             "cam1.distortion_model: must",
         ),
-        ("0.001, 0.002]", "0.001]", "cam0.distortion_coeffs: must have 4 numbers, got 3"),
     ],
 )
 def test_a_bad_lens_of_a_camchain_is_named_with_its_key(tmp_path, old, new, expected):
@@ -558,22 +534,9 @@ def test_a_camchain_is_chained(tmp_path):
         (
             "camera_model: pinhole",
             "camera_model: fov",
-            "cam0.camera_model: must be one of pinhole, omni, ds, eucm, got 'fov'",
+            "cam0.camera_model: must be 'pinhole', 'omni', 'ds' or 'eucm', got the text 'fov'",
         ),
-        (
-            "camera_model: pinhole",
-            "camera_model: ds",
-            "cam0.intrinsics: must be xi alpha fu fv pu pv, got 4 numbers",
-        ),
-        (
-            "distortion_model: equi",
-            "distortion_model: fov",
-            "cam0.distortion_model: must be one of",
-        ),
-        ("[-0.01, 0, 0.01, 0]", "[-0.01, 0]", "cam0.distortion_coeffs: must have 4 numbers, got 2"),
         ("0.001, 0.002]", "0]", "cam1.distortion_coeffs: must have 4 or 5 numbers, got 3"),
-        ("[470, 471.5,", "[0, 471.5,", "cam0.intrinsics: the focal lengths must be > 0"),
-        ("[470, 471.5, ", "[", "cam0.intrinsics: must be fu fv pu pv, got 2 numbers"),
         ("T_cam_imu", "T_imu", "cam0.T_cam_imu: missing"),
         (
             "    - [0, -1, 0, 0.1]",

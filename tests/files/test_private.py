@@ -1,10 +1,8 @@
 """Folders whose content is executed: files that others could have put there are never read."""
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -89,9 +87,6 @@ def test_a_link_is_not_followed(folder, tmp_path, part):
     path.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(NotPrivateError, match=f"{part} is a link"):
         read(folder)
-    if part.endswith("one"):
-        with PrivateFolder(folder) as found, pytest.raises(OSError, match="symbolic links"):
-            found.read("one")
 
 
 def test_a_link_in_the_root_folder_is_followed(monkeypatch, folder):
@@ -100,15 +95,6 @@ def test_a_link_in_the_root_folder_is_followed(monkeypatch, folder):
     monkeypatch.setattr(Path, "readlink", lambda path: linked.relative_to("/"))
     with PrivateFolder(Path("/short", *folder.parts[2:])) as found:
         assert found.path == folder
-
-
-def test_what_was_judged_is_what_is_read(folder, tmp_path):
-    """Another folder that takes the name of an open one changes nothing."""
-    with PrivateFolder(folder) as found:
-        folder.rename(tmp_path / "aside")
-        folder.mkdir()
-        (folder / "one").write_bytes(b"another")
-        assert found.read("one") == b"content"
 
 
 def test_no_file_and_no_folder(folder, tmp_path):
@@ -131,71 +117,35 @@ def test_a_large_file_is_not_read(folder, monkeypatch):
         read(folder)
 
 
-# Processes that write to a folder, each by one argument: killed or halted before the file has its
-# name, or as often as a byte is to be seen.
+def test_what_a_killed_process_has_left_is_removed_and_a_living_one_keeps_its_own(folder):
+    left, living = (folder / f".jaxnav-{16 * digit}.step" for digit in "ab")
+    for path in (left, living):
+        path.write_bytes(b"half")
+    os.utime(left, (0, 0))
+    with PrivateFolder(folder) as found:
+        found.write("two", b"2")
+    assert {path.name for path in folder.iterdir()} == {"one", "two", living.name}
+    assert read(folder) == b"content"
+
+
+# Two processes that write the same file, as often as a byte is to be seen.
 WRITERS = """
-import os, signal, sys
+import os, sys
 from pathlib import Path
 from jaxnav.files.private import PrivateFolder
 
-def write(role):
-    with PrivateFolder(Path(sys.argv[1]), make=True) as folder:
-        if role.startswith("SIG"):
-            os.rename = lambda *_, **__: os.kill(os.getpid(), getattr(signal, role))
-            folder.write("one", b"half")
-        for _ in range(200):
-            folder.write("one", role.encode() * 10_000)
-
-children = {}
-for role in sys.argv[2:]:
-    child = os.fork()
-    if child == 0:
-        os.close(1)  # nobody waits for what is halted
-        write(role)
+for letter in (b"a", b"b"):
+    if os.fork() == 0:
+        with PrivateFolder(Path(sys.argv[1]), make=True) as folder:
+            for _ in range(200):
+                folder.write("one", letter * 10_000)
         os._exit(0)
-    _, status = os.waitpid(child, os.WUNTRACED) if role.startswith("SIG") else (0, 0)
-    children[role] = child
-    if role == "SIGSTOP":
-        print(child)
-for role, child in children.items():
-    if not role.startswith("SIG"):
-        assert os.waitpid(child, 0)[1] == 0
+assert [os.wait()[1] for _ in "ab"] == [0, 0]
 """
-
-
-def write_from_processes(path: Path, *roles: str) -> str:
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", WRITERS, str(path), *roles],
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    return run.stdout
-
-
-def test_what_a_killed_process_has_left_is_swept_and_a_living_one_keeps_its_own(folder):
-    write_from_processes(folder, "SIGKILL")
-    (left,) = folder.glob(".part-*")
-    halted = int(write_from_processes(folder, "SIGSTOP"))
-    try:
-        assert not left.exists()
-        (left,) = folder.glob(".part-*")
-        with PrivateFolder(folder) as found:
-            found.write("two", b"2")
-        assert left.read_bytes() == b"half"
-        assert read(folder) == b"content"
-    finally:
-        os.kill(halted, signal.SIGKILL)
-    while Path(f"/proc/{halted}/fd/0").exists():  # it holds its lock until it is quite gone
-        time.sleep(0.01)
-    with PrivateFolder(folder) as found:
-        found.write("two", b"2")
-    assert {path.name for path in folder.iterdir()} == {"one", "two"}
 
 
 def test_two_at_once_leave_one_whole_file(tmp_path):
     path = tmp_path / "new" / "folder"
-    write_from_processes(path, "a", "b")
+    subprocess.run([sys.executable, "-W", "ignore", "-c", WRITERS, path], check=True, timeout=120)
     assert read(path) in (b"a" * 10_000, b"b" * 10_000)
     assert [file.name for file in path.iterdir()] == ["one"]

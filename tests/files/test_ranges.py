@@ -14,7 +14,7 @@ from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.drive.stamps import MOST_NS, Stamps
 from jaxnav.errors import BadInput
-from jaxnav.files.ranges import RANGES, is_within, pinhole_problem, problem_of, table
+from jaxnav.files.ranges import RANGES, is_within, pinhole_problem, problem_of
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import validate
 from jaxnav.recordings.drive_format import decode, encode
@@ -157,7 +157,20 @@ def test_corners_that_are_nowhere_are_dropped_and_counted(tmp_path):
 
 
 def test_the_page_for_users_shows_the_table():
-    assert table() in PAGE.read_text()
+    """If it fails, put what it expects into docs/ranges.md."""
+    lines = ["| quantity | from | to | unit | outside of it |", "|---|---|---|---|---|"]
+    for allowed in RANGES.values():
+        bounds = f"{_number(allowed.least)} | {_number(allowed.most)}"
+        lines.append(f"| {allowed.what} | {bounds} | {allowed.unit} | {allowed.outside} |")
+    assert "\n".join(lines) + "\n" in PAGE.read_text()
+
+
+def _number(value: float) -> str:
+    for power in (62, 63):
+        for sign, off in ((1, -1), (-1, 1), (-1, 0)):
+            if value == sign * 2**power + off and isinstance(value, int):
+                return f"{'-' if sign < 0 else ''}2^{power}{f' {off:+d}' if off else ''}"
+    return f"{value:.10g}"
 
 
 @pytest.mark.parametrize("name", RANGES)

@@ -77,6 +77,20 @@ def tiff_tile(path: Path) -> Path:
     return path
 
 
+def tiff_tags(path: Path) -> Path:
+    """Its width is there twice: the first one counts for libtiff, the last one for Pillow."""
+    tags = [(256, 2**16), (256, 16), (257, 2**15), (258, 8), (259, 1), (262, 1), (277, 1), (273, 8)]
+    entries = b"".join(struct.pack("<HHLL", tag, 4, 1, value) for tag, value in tags)
+    path.write_bytes(b"II*\0" + struct.pack("<LH", 8, len(tags)) + entries + bytes(400))
+    return path
+
+
+def pnm_comment(path: Path) -> Path:
+    """A comment within a number: 30 000 x 1 for Pillow, 30 000 x 30 000 for OpenCV."""
+    path.write_bytes(b"P5 30000#30000\n 1 255\n" + bytes(30_000))
+    return path
+
+
 # --- text ---
 
 
@@ -240,6 +254,8 @@ PICTURES: dict[str, Callable[[Path], Path]] = {
     "a.png": png,
     "a.jpg": jpeg_scans,
     "a.tif": tiff_tile,
+    "twice.tif": tiff_tags,
+    "a.pgm": pnm_comment,
 }
 ARRAYS: dict[str, Callable[[Path], Path]] = {
     "shape.npz": npz_shape,

@@ -14,9 +14,10 @@ from jaxnav.core.models.lenses import LENSES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.cameras import camera_file
-from jaxnav.files.figures import CameraFigures, MarkerFigures
-from jaxnav.files.markers import MarkerFile
+from jaxnav.files.kalibr import names_by_topic
+from jaxnav.files.markers import MarkerEntry, MarkerFile
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import CameraEntry, pose_entry
 
 QCAR = files.calib_dir() / "qcar"
 
@@ -36,15 +37,15 @@ def problem(source: Path, to: str, out: Path, **flags: Any) -> str:
     return line
 
 
-def cameras_in(path: Path) -> tuple[CameraFigures, ...]:
-    return camera_file(path, read_mapping(path), by_topic=True).cameras
+def cameras_in(path: Path) -> tuple[CameraEntry, ...]:
+    return camera_file(path, read_mapping(path), names_by_topic).cameras
 
 
-def markers_in(path: Path) -> list[MarkerFigures]:
-    return [entry.figures() for entry in MarkerFile.model_validate(read_mapping(path)).markers]
+def markers_in(path: Path) -> list[MarkerEntry]:
+    return [entry.placed() for entry in MarkerFile.model_validate(read_mapping(path)).markers]
 
 
-def same_lens(a: CameraFigures, b: CameraFigures) -> bool:
+def same_lens(a: CameraEntry, b: CameraEntry) -> bool:
     """All but the place, bit for bit."""
     keys = ("name", "lens", "focal_px", "center_px", "distortion", "image_size_px")
     return all(getattr(a, key) == getattr(b, key) for key in keys)
@@ -69,7 +70,7 @@ def numbers(least: float, most: float) -> st.SearchStrategy[float]:
 
 
 @st.composite
-def a_camera(draw, lens: str, name: str = "front", k3: bool = True) -> CameraFigures:
+def a_camera(draw, lens: str, name: str = "front", k3: bool = True) -> CameraEntry:
     within = LENSES[lens].within
     bounds = [within.get(key, (-10.0, 10.0)) for key in LENSES[lens].coefficients]
     coefficients = [draw(st.floats(least, min(most, 10.0))) for least, most in bounds]
@@ -84,13 +85,13 @@ def a_camera(draw, lens: str, name: str = "front", k3: bool = True) -> CameraFig
     T = np.array([*q, *(draw(numbers(-500, 500)) for _ in range(3))])
     width, height = draw(st.integers(1, 65536)), draw(st.integers(1, 65536))
     focal = st.floats(*(bound * max(width, height) for bound in (1e-3, 1e3)))
-    return CameraFigures.create(
+    return CameraEntry.create(
         name,
         lens,
         [draw(focal), draw(focal), *(draw(numbers(-n, 2 * n)) for n in (width, height))],
         coefficients,
         (width, height),
-        T if draw(st.booleans()) else poses.matrix(T),
+        T_camera_vehicle=pose_entry(T) if draw(st.booleans()) else poses.matrix(T).tolist(),
     )
 
 

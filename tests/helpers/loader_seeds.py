@@ -23,11 +23,12 @@ from jaxnav.core.parameters import parameters_of
 from jaxnav.experiments.studies.store import open_store
 from jaxnav.files.cameras import camera_file
 from jaxnav.files.images import read_image
+from jaxnav.files.kalibr import names_by_topic
 from jaxnav.files.markers import marker_map
 from jaxnav.files.poses import pose_as_read
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.ros import load_ros
-from jaxnav.files.wpilib import layout_figures, layout_left_out
+from jaxnav.files.wpilib import layout_left_out, layout_markers
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.other.recordings import read_recording
@@ -251,7 +252,7 @@ def _picture(extension: str) -> Callable[[Path], Path]:
 def _layout(path: Path) -> Any:
     """A WPILib field layout as a map of ours."""
     data = read_mapping(path)
-    markers = layout_figures(path, data)
+    markers = layout_markers(path, data)
     assert all(isinstance(key, str) for key in layout_left_out(data))
     return marker_map(
         np.stack([pose_as_read(marker.T_world_marker) for marker in markers]),
@@ -264,7 +265,7 @@ def _layout(path: Path) -> Any:
 def _cameras(path: Path) -> Any:
     """All cameras of a file, as `jaxnav calibrate convert` takes them."""
     data = read_mapping(path)
-    file = camera_file(path, data, by_topic=True)
+    file = camera_file(path, data, names_by_topic)
     assert all(isinstance(key, str) for key in file.left_out)
     return [camera.camera() for camera in file.cameras]
 

@@ -172,7 +172,7 @@ def test_parameters_reach_the_navigator_and_come_with_the_header():
     setup = qcar_setup()
     assert "parameters" not in setup.header()  # as older programs read it
     values = {"motion.odometry_sigma": [0.1, 0.2, 0.3], "selector.floor_m": 1e-3}
-    tuned = setup.with_params(Params.of(values, WHERE))
+    tuned = setup.with_params(Params.from_values(values, WHERE))
     back = DriveSetup.from_header(decode(encode(tuned.header())), WHERE)
     for one in (tuned, back):
         found = parameters_of(one.navigator())
@@ -181,11 +181,11 @@ def test_parameters_reach_the_navigator_and_come_with_the_header():
         assert float(found["motion.tilt_sigma_rad"]) == 0.005
     # Another selector may lack a number; another file takes the place of the whole one.
     assert dataclasses.replace(back, selector="paper-cost").navigator()
-    assert back.with_params(Params.of({"corner_sigma_px": 2}, WHERE)).parameters == {
+    assert back.with_params(Params.from_values({"corner_sigma_px": 2}, WHERE)).parameters == {
         "corner_sigma_px": 2.0
     }
     with pytest.raises(BadInput, match=r"^drive.mcap: parameters.motion.vision_floor: must have 3"):
-        setup.with_params(Params.of({"motion.vision_floor": [1] * 6}, WHERE))
+        setup.with_params(Params.from_values({"motion.vision_floor": [1] * 6}, WHERE))
 
 
 def test_what_parameters_say_of_cameras_and_sensors_the_setup_says_itself():
@@ -194,7 +194,7 @@ def test_what_parameters_say_of_cameras_and_sensors_the_setup_says_itself():
     values = {"motion.vehicle.sensor_sigma": sigma, "rig.extrinsics_sigma": turned}
     tuned = dataclasses.replace(
         qcar_setup(), rig=worlds.qcar_rig_by_hand(), vehicle=worlds.qcar_by_hand()
-    ).with_params(Params.of(values, WHERE))
+    ).with_params(Params.from_values(values, WHERE))
     rule = dataclasses.replace(tuned, selector="paper-cost")
     for one in (tuned, rule):
         for setup in (one, DriveSetup.from_header(decode(encode(one.header())), WHERE)):
@@ -207,7 +207,7 @@ def test_what_parameters_say_of_cameras_and_sensors_the_setup_says_itself():
 
 def test_a_rule_without_a_gate_drives_without_one():
     """Also where its header has the gate that other rules were given."""
-    tuned = qcar_setup().with_params(Params.of({"motion.gate_nis": 30}, WHERE))
+    tuned = qcar_setup().with_params(Params.from_values({"motion.gate_nis": 30}, WHERE))
     for selector, gate_nis in (("paper-cost", 30), ("paper-cost-ungated", math.inf)):
         header = dataclasses.replace(tuned, selector=selector).header()
         navigator = DriveSetup.from_header(decode(encode(header)), WHERE).navigator()

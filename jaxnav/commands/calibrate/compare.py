@@ -12,8 +12,8 @@ from jaxnav.commands.process import configure_jax
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder
 from jaxnav.files.cameras import camera_file
-from jaxnav.files.figures import CameraFigures
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import CameraEntry
 from jaxnav.pictures.lens import comparison
 
 
@@ -23,7 +23,7 @@ def run(args: CalibrateCompare) -> int:
     pairs = _pairs(args)
     folder = output_folder(args.out)
     maps = {
-        name: projection_difference(one.camera(), other.camera(), one.image_size_px)
+        name: projection_difference(one.camera(), other.camera(), one.size_px)
         for name, (one, other) in pairs.items()
     }
     cameras = {name: _report(*pairs[name], maps[name]) for name in pairs}
@@ -40,7 +40,7 @@ def run(args: CalibrateCompare) -> int:
     return 0
 
 
-def _pairs(args: CalibrateCompare) -> dict[str, tuple[CameraFigures, CameraFigures]]:
+def _pairs(args: CalibrateCompare) -> dict[str, tuple[CameraEntry, CameraEntry]]:
     one, other = (_cameras(path) for path in (args.one, args.other))
     if len(one) == len(other) == 1:
         other = {next(iter(one)): next(iter(other.values()))}
@@ -60,11 +60,11 @@ def _pairs(args: CalibrateCompare) -> dict[str, tuple[CameraFigures, CameraFigur
     return {name: (one[name], other[name]) for name in both}
 
 
-def _cameras(path: Path) -> dict[str, CameraFigures]:
+def _cameras(path: Path) -> dict[str, CameraEntry]:
     return {camera.name: camera for camera in camera_file(path, read_mapping(path)).cameras}
 
 
-def _report(one: CameraFigures, other: CameraFigures, difference: ImageMap) -> dict[str, Any]:
+def _report(one: CameraEntry, other: CameraEntry, difference: ImageMap) -> dict[str, Any]:
     both, length_px = (one, other), difference.length_px
     known = np.isfinite(length_px)
     report: dict[str, Any] = {

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from jaxnav.commands.calibrate.arguments import CalibrateConvert
@@ -10,20 +10,19 @@ from jaxnav.core.models.rig import UNKNOWN_TIMING
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, wpilib
 from jaxnav.files.cameras import camera_file, choose_camera
-from jaxnav.files.figures import CameraFigures, MarkerFigures
-from jaxnav.files.kalibr import camchain_text
-from jaxnav.files.markers import MarkerFile, markers_left_out, markers_text
+from jaxnav.files.kalibr import camchain_text, names_by_topic
+from jaxnav.files.markers import MarkerEntry, MarkerFile, markers_left_out, markers_text
 from jaxnav.files.matrix_cameras import camera_info_text, opencv_text, photonvision_text
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import place, rig_text
+from jaxnav.files.rigs import CameraEntry, place, rig_text
 from jaxnav.files.validation import validate
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting
 
-_MANY: dict[str, Callable[[Sequence[CameraFigures]], str]] = {
+_MANY: dict[str, Callable[[Sequence[CameraEntry]], str]] = {
     "jaxnav": rig_text,
     "kalibr": camchain_text,
 }
-_ONE: dict[str, Callable[[CameraFigures], str]] = {
+_ONE: dict[str, Callable[[CameraEntry], str]] = {
     "ros": camera_info_text,
     "opencv": opencv_text,
     "photonvision": photonvision_text,
@@ -37,8 +36,8 @@ class _Source:
     """The content of SOURCE: its format, cameras or markers, and what is not carried over."""
 
     format: str
-    cameras: tuple[CameraFigures, ...]
-    markers: tuple[MarkerFigures, ...]
+    cameras: tuple[CameraEntry, ...]
+    markers: tuple[MarkerEntry, ...]
     left_out: tuple[str, ...]
 
 
@@ -74,13 +73,13 @@ def _read(args: CalibrateConvert) -> _Source:
     data = read_mapping(path)
     if "markers" in data:
         map_file = validate(MarkerFile, data, path)
-        markers = tuple(entry.figures() for entry in map_file.markers)
+        markers = tuple(entry.placed() for entry in map_file.markers)
         return _Source("jaxnav", (), markers, tuple(markers_left_out(map_file)))
     if wpilib.is_layout(data):
         size_m = args.marker_size_m or wpilib.SIZE_M
-        markers = tuple(wpilib.layout_figures(path, data, size_m, args.family or wpilib.FAMILY))
+        markers = tuple(wpilib.layout_markers(path, data, size_m, args.family or wpilib.FAMILY))
         return _Source("wpilib", (), markers, tuple(wpilib.layout_left_out(data)))
-    file = camera_file(path, data, by_topic=True)
+    file = camera_file(path, data, names_by_topic)
     return _Source(file.format, file.cameras, (), file.left_out)
 
 
@@ -149,25 +148,26 @@ def _cameras(args: CalibrateConvert, source: _Source) -> _Written:
     )
 
 
-def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraFigures, ...]:
+def _chosen(args: CalibrateConvert, source: _Source) -> tuple[CameraEntry, ...]:
     """The cameras that the flags choose, with the name and place that the flags give."""
     cameras = source.cameras
     if args.camera_name is not None:
         if len(cameras) > 1:
             cameras = (choose_camera(args.source, cameras, args.camera_name),)
         else:
-            cameras = (replace(cameras[0], name=args.camera_name),)
+            cameras = (cameras[0].model_copy(update={"name": args.camera_name}),)
     if args.position_m is not None:
         if len(cameras) > 1:
             raise BadInput("--position-m", "is of one camera: choose it with --camera-name")
         if cameras[0].T_camera_vehicle is not None:
             raise BadInput("--position-m", f"{args.source} says where the camera is already")
         angles_deg = (args.yaw_deg, args.elevation_deg, args.roll_deg)
-        cameras = (replace(cameras[0], T_camera_vehicle=place(args.position_m, angles_deg)),)
+        placed = {"T_camera_vehicle": place(args.position_m, angles_deg)}
+        cameras = (cameras[0].model_copy(update=placed),)
     return cameras
 
 
-def _paths(args: CalibrateConvert, cameras: Sequence[CameraFigures]) -> list[Path]:
+def _paths(args: CalibrateConvert, cameras: Sequence[CameraEntry]) -> list[Path]:
     """The output file of each camera: --out itself, or files in the folder --out."""
     suffixes = _SUFFIXES.get(args.to, _YAML)
     if len(cameras) == 1 and args.out.suffix and not args.out.is_dir():

@@ -17,13 +17,12 @@ from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
-from jaxnav.files import output_folder
+from jaxnav.files import load_rig, output_folder
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import (
     CameraEntry,
     CameraSigma,
     RigFile,
-    load_rig,
     rig_data,
     save_rig,
 )

@@ -29,8 +29,9 @@ from jaxnav.detection.acquire import acquire_in_photograph
 from jaxnav.detection.families import LARGEST_FAMILIES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.cameras import load_figures
+from jaxnav.files.cameras import load_camera_entry
 from jaxnav.files.images import MIRRORED, read_photograph
+from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 
 _FREEDOM = 2  # of a marker's eight numbers: a pose has six
 _CLOSER_LOOKS = 400
@@ -61,8 +62,9 @@ def run(args: Locate) -> int:
         raise BadInput("--out", f"must end in .png or .jpg, got {args.out}")
     configure_jax(float64=True)
     detectors = detectors_for(args.corner_backend, args.family)
-    figures = load_figures(args.camera, args.camera_name)
-    camera, size_px, lens_sigma_px = figures.camera(), figures.image_size_px, figures.lens_sigma_px
+    entry = load_camera_entry(args.camera, args.camera_name)
+    camera, size_px = entry.camera(), entry.size_px
+    lens_sigma_px = entry.sigma.lens_px() if entry.sigma else None
     image, orientation = read_photograph(args.image)
     height, width = image.shape[:2]
     if (width, height) != size_px:
@@ -330,7 +332,6 @@ def _draw(
 ) -> None:
     """Draw the markers and both poses of each into the photograph."""
     # It imports matplotlib.
-    from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 
     sticks: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for marker in markers:

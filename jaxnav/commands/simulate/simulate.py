@@ -19,10 +19,9 @@ from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
 from jaxnav.files import limits, load_params, write_json
-from jaxnav.files.locking import sole_writer
 from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
-from jaxnav.files.writing import plain_data
+from jaxnav.files.writing import plain_data, sole_writer
 from jaxnav.sim.rollout import Rollout
 from jaxnav.sim.scenarios import Scenario, on_laps
 from jaxnav.sim.scores import Drives

@@ -20,7 +20,7 @@ from jaxnav.experiments.studies.running import (
 )
 from jaxnav.experiments.studies.store import open_store, sweep_unfinished
 from jaxnav.files import output_folder
-from jaxnav.files.locking import sole_writer
+from jaxnav.files.writing import sole_writer
 
 
 def run(args: Arguments) -> int:

@@ -123,7 +123,7 @@ def decompress_bag(path: Path) -> Iterator[Path]:
         plain = Path(folder) / path.stem
         try:
             with plain.open("wb") as target:
-                copy_bz2(path, target, Budget.of_file(path))
+                copy_bz2(path, target, Budget.from_file(path))
         except (OSError, EOFError, ValueError) as error:
             raise BadInput(path, f"can't be decompressed: {str(error).lower()}") from None
         yield plain
@@ -274,7 +274,7 @@ def _budget(path: Path) -> Budget:
     for file in path.iterdir() if path.is_dir() else [path]:
         if not file.is_dir():
             check_regular(file)
-        budget.left += Budget.of_file(file).left
+        budget.left += Budget.from_file(file).left
     return budget
 
 

@@ -1,6 +1,5 @@
 """Read decoded TagSLAM recordings: one .npz with a row for each detection."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,10 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import PLACED_BY_CALIBRATION, CameraRig
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.figures import CameraFigures, coefficients_problem, rig_from_figures
 from jaxnav.files.markers import marker_map
 from jaxnav.files.npz import read_npz
 from jaxnav.files.ranges import is_within, pinhole_problem, problem_of
+from jaxnav.files.rigs import CameraEntry, CameraSigma, coefficients_problem, pose_entry, rig_of
 from jaxnav.recordings.other.recording import TO_OURS, Rows, Source
 
 # key -> shape, whose letters are sizes that must agree; kind (i: whole numbers, f: numbers, U:
@@ -166,10 +165,13 @@ def _rig(path: Path, stored: _Stored) -> CameraRig:
         if wrong is not None:
             raise BadInput(f"{path}: K[{index}]", wrong)
         name = str(stored["cam_names"][index])
-        cameras.append(CameraFigures.create(name, lens, K, distortion[:count], size_px))
-    return rig_from_figures(
+        cameras.append(CameraEntry.create(name, lens, K, distortion[:count], size_px))
+    sigma = CameraSigma.from_place(PLACED_BY_CALIBRATION)
+    return rig_of(
         [
-            replace(camera, T_camera_vehicle=poses.inverse(T), sigma=PLACED_BY_CALIBRATION)
+            camera.model_copy(
+                update={"T_camera_vehicle": pose_entry(poses.inverse(T)), "sigma": sigma}
+            )
             for camera, T in zip(cameras, _poses(path, "T_rig_cam", stored), strict=True)
         ]
     )

@@ -95,7 +95,7 @@ def replay(
     Raises:
         BadInput: a parameter that does not fit a rig that moves freely.
     """
-    params = Params.of({}, "") if params is None else params
+    params = Params.from_values({}, "") if params is None else params
     if corner_sigma_px is not None:
         params = params.without("corner_sigma_px")
     elif "corner_sigma_px" not in params.values:

@@ -24,10 +24,10 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection.types import Detections
 from jaxnav.errors import BadInput
 from jaxnav.files import kalibr, limits, poses
-from jaxnav.files.figures import rig_from_figures
 from jaxnav.files.markers import marker_map
 from jaxnav.files.ranges import is_within, within
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.rigs import pose_entry, rig_of
 from jaxnav.files.topics import OdometrySigma
 from jaxnav.files.validation import (
     Count,
@@ -298,8 +298,8 @@ def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: _Edges, body:
             if key not in written:
                 raise BadInput(at(file, key), f"missing, and no /tf from {body} to {key} either")
             T_body_camera = validate(_CameraPoseEntry, written[key], file, key).pose.pose()
-        cameras.append(entry.figures(key, poses.inverse(T_body_camera)))
-    return rig_from_figures(cameras)
+        cameras.append(entry.camera(key, pose_entry(poses.inverse(T_body_camera))))
+    return rig_of(cameras)
 
 
 def _markers(path: Path, edges: _Edges) -> MarkerMap:

@@ -14,8 +14,8 @@ import jaxlie
 
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures
 from jaxnav.files.matrix_cameras import CameraInfo
+from jaxnav.files.rigs import CameraEntry
 from jaxnav.files.validation import at, validate
 from jaxnav.vehicles.ros.connection import Connection
 
@@ -27,7 +27,7 @@ _PLAIN = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 
 def await_lenses(
     path: Path, topics: Mapping[str, str], rectified: bool, check: Callable[[], None]
-) -> dict[str, CameraFigures]:
+) -> dict[str, CameraEntry]:
     """Wait for a CameraInfo on each topic.
 
     Args:
@@ -59,7 +59,7 @@ def await_lenses(
     return {name: read_lens(topics[name], message, rectified) for name, message in came.items()}
 
 
-def read_lens(topic: str, message: Any, rectified: bool) -> CameraFigures:
+def read_lens(topic: str, message: Any, rectified: bool) -> CameraEntry:
     """The camera in a CameraInfo.
 
     Args:
@@ -81,10 +81,10 @@ def read_lens(topic: str, message: Any, rectified: bool) -> CameraFigures:
         "distortion_model": model,
         "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "data": coefficients},
     }
-    return validate(CameraInfo, data, Path(topic)).figures(Path(topic), topic)
+    return validate(CameraInfo, data, Path(topic)).camera(Path(topic), topic)
 
 
-def with_lenses(rig: CameraRig, lenses: Mapping[str, CameraFigures]) -> CameraRig:
+def with_lenses(rig: CameraRig, lenses: Mapping[str, CameraEntry]) -> CameraRig:
     """The rig with other lenses and image sizes for the cameras of these names."""
     given = [lenses.get(name) for name in rig.names]
     return CameraRig.create(
@@ -92,7 +92,7 @@ def with_lenses(rig: CameraRig, lenses: Mapping[str, CameraFigures]) -> CameraRi
         [jaxlie.SE3(wxyz_xyz) for wxyz_xyz in rig.Ts_camera_vehicle.wxyz_xyz],
         rig.names,
         [
-            size_px if one is None else one.image_size_px
+            size_px if one is None else one.size_px
             for size_px, one in zip(rig.image_sizes_px, given, strict=True)
         ],
         rig.extrinsics_sigma,

@@ -12,8 +12,7 @@ from jaxnav.commands.calibrate.arguments import CalibrateConvert
 from jaxnav.commands.kinds import check_values
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
-from jaxnav.files.figures import CameraFigures
-from jaxnav.files.rigs import rig_text
+from jaxnav.files.rigs import CameraEntry, rig_text
 from tests.helpers.conversions import (
     KALIBR,
     PHOTONVISION,
@@ -25,10 +24,15 @@ from tests.helpers.conversions import (
 )
 
 
-def camera(lens: str, distortion: list[float] | None = None, name: str = "front") -> CameraFigures:
+def camera(lens: str, distortion: list[float] | None = None, name: str = "front") -> CameraEntry:
     count = LENS_COEFFICIENTS[lens]
-    return CameraFigures.create(
-        name, lens, [400.0, 401.0, 320.0, 240.0], distortion or [0.0] * count, (640, 480), np.eye(4)
+    return CameraEntry.create(
+        name,
+        lens,
+        [400.0, 401.0, 320.0, 240.0],
+        distortion or [0.0] * count,
+        (640, 480),
+        T_camera_vehicle=np.eye(4).tolist(),
     )
 
 
@@ -148,7 +152,7 @@ def test_a_camera_without_lens_is_written_with_zeros(tmp_path, capsys):
         out = convert(source, to, tmp_path / to)
         assert "that front is without lens: written as zeros" in capsys.readouterr().out
         (path,) = out.iterdir()
-        assert cameras_in(path)[0].distortion == (0.0,) * 5
+        assert cameras_in(path)[0].distortion == [0.0] * 5
 
 
 def test_the_command_line_reaches_it(tmp_path, capsys):

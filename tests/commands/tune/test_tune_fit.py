@@ -16,7 +16,7 @@ from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of
 from jaxnav.experiments.tuning.objective import Batch, Objective, where_not_finite
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import load_params
-from jaxnav.files.locking import sole_writer
+from jaxnav.files.writing import sole_writer
 from tests import worlds
 
 NAVIGATOR = with_parameters(

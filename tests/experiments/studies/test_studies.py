@@ -38,7 +38,7 @@ from jaxnav.experiments.studies.study import (
     nobody,
 )
 from jaxnav.experiments.studies.summary import order_statistic, summarise
-from jaxnav.files.locking import sole_writer
+from jaxnav.files.writing import sole_writer
 from jaxnav.sim.statistics import wilson_interval
 
 PARAMETERS = {

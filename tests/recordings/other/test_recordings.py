@@ -340,7 +340,7 @@ def test_odometry_between_its_poses(data_dir):
     ("file", "old", "new", "expected"),
     [
         ("cameras", "equidistant", "fov", "cameras.yaml: cam0.distortion_model: must be one of"),
-        ("cameras", "pinhole", "fov", "cameras.yaml: cam0.camera_model: must be one of pinhole, "),
+        ("cameras", "pinhole", "fov", "cameras.yaml: cam0.camera_model: must be 'pinhole', "),
         ("cameras", "pinhole", "omni", "cameras.yaml: cam0.intrinsics: must be xi fu fv pu pv"),
         ("cameras", "[400,", "[0,", "cameras.yaml: cam0.intrinsics: the focal lengths must be > 0"),
         ("cameras", "/a/tags", "/b/tags", "cam0.tagtopic: no bags have /b/tags of apriltag_msgs"),

@@ -27,9 +27,9 @@ def info(**changes) -> SimpleNamespace:
 
 def test_an_image_as_it_comes_has_k_and_d():
     lens = read_lens("/front/camera_info", info(), rectified=False)
-    assert (lens.lens, lens.focal_px, lens.center_px) == ("radtan", (400.0, 410.0), (310.0, 230.0))
+    assert (lens.lens, lens.focal_px, lens.center_px) == ("radtan", [400.0, 410.0], [310.0, 230.0])
     np.testing.assert_allclose(lens.distortion[:4], [-0.3, 0.1, 0.001, -0.002])
-    assert lens.image_size_px == (640, 480)
+    assert lens.image_size_px == [640, 480]
     wide = info(distortion_model="equidistant", d=[0.1, 0.2, 0.3, 0.4])
     assert read_lens("/front", wide, rectified=False).lens == "equidistant"
     ideal = read_lens("/front", info(distortion_model="", d=[]), rectified=False)
@@ -38,7 +38,7 @@ def test_an_image_as_it_comes_has_k_and_d():
 
 def test_a_rectified_image_has_p_and_no_distortion():
     lens = read_lens("/front/camera_info", info(), rectified=True)
-    assert (lens.focal_px, lens.center_px) == ((380.0, 390.0), (305.0, 225.0))
+    assert (lens.focal_px, lens.center_px) == ([380.0, 390.0], [305.0, 225.0])
     assert set(lens.distortion) == {0.0}
 
 
