@@ -1,23 +1,17 @@
 """The compiled step against the jitted one: the same numbers, and nothing compiled twice."""
 
-import hashlib
-import json
 import os
-import pathlib
-import pickle
 import shutil
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.navigator import Navigator
-from jaxnav.detection.edges import EdgeFit
 from jaxnav.drive.compiled_step import compiled_step, is_compiled
-from jaxnav.files import executable_bytes, executables
+from jaxnav.files import executables
 from jaxnav.recordings import drive_setup
 from tests import worlds
 
@@ -71,7 +65,7 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     for raw in damaged(file.read_bytes()):
         file.write_bytes(raw)
         with monkeypatch.context() as unopened:
-            unopened.setattr(executable_bytes, "_small_program", never)
+            unopened.setattr(executables.pickle, "loads", never)
             assert executables._loaded(tmp_path, file.name, []) is None
     repaired, _ = compiled_step(nav, tmp_path)(nav.init(), obs)
     jax.tree.map(np.testing.assert_array_equal, repaired, state)
@@ -155,71 +149,9 @@ def test_old_files_go_and_a_full_disk_is_no_failure(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "rename", full)
+    monkeypatch.setattr(os, "replace", full)
     executables._keep(folder, names[5], b"5")
     assert {path.name for path in folder.iterdir()} == {*names[2:5], "bracket.step"}
-
-
-class Writes:
-    """Unpickled, it makes a file."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return pathlib.Path.touch, (self.path,)
-
-
-def test_nothing_that_a_file_holds_is_run_as_python(tmp_path):
-    """A pickle in its place, or in place of any of its parts, whole and with a right checksum."""
-    canary = tmp_path / "canary"
-    pickled = pickle.dumps(Writes(canary))
-    run = jax.jit(lambda leaves: leaves).lower([jnp.zeros(2)]).compile()
-    good = executable_bytes.to_bytes(run, [0])
-    content = good[executable_bytes._CHECKSUM_BYTES :]
-    (length,) = executable_bytes._LENGTH.unpack_from(content)
-    head, code = content[8 : 8 + length], content[8 + length :]
-    packed = executable_bytes._LENGTH.pack
-    bad = [
-        pickled,
-        packed(len(head)) + head + pickled,
-        packed(len(pickled)) + pickled + code,
-    ]
-    named = [
-        "os:system",
-        "jaxnav.cli:main",
-        "jaxnav.drive.plugins:load_factory",
-        "builtins:type",
-        "no",
-    ]
-    for name in named:
-        other = head.replace(b'"tree": ["list", 0]', f'"tree": ["{name}", {{}}]'.encode())
-        assert other != head
-        bad.append(packed(len(other)) + other + code)
-    inputs = [jax.ShapeDtypeStruct((2,), jnp.zeros(2).dtype)]
-    executables._keep(tmp_path / "steps", "one", good)
-    ready, structure = executables._loaded(tmp_path / "steps", "one", inputs)
-    np.testing.assert_array_equal(ready([np.array([1.0, 2.0])])[0], [1.0, 2.0])
-    assert structure == jax.tree.structure([0])
-    for content in bad:
-        raw = hashlib.sha256(content).digest() + content
-        executables._keep(tmp_path / "steps", "one", raw)
-        assert executables._loaded(tmp_path / "steps", "one", inputs) is None
-    assert not canary.exists()
-    pickle.loads(pickled)
-    assert canary.exists()  # it would have shown
-
-
-def test_a_tree_is_the_same_again():
-    """Modules, named tuples, dicts, None; what has no fields to tell is refused."""
-    state, out = jax.eval_shape(navigator().init), {"a": (None, [EdgeFit(*range(8))])}
-    for tree in (state, out, (), []):
-        shape = jax.tree.map(lambda leaf: 0, tree)
-        plain = json.loads(json.dumps(executable_bytes._plain(shape)))
-        again = executable_bytes._tree(plain)
-        assert jax.tree.structure(again) == jax.tree.structure(shape)
-    with pytest.raises(executable_bytes.NotStorableError):
-        executable_bytes._plain(OnesOwn())
 
 
 def test_of_a_folder_that_is_not_this_users_nothing_is_loaded(tmp_path, monkeypatch):
@@ -235,7 +167,7 @@ def test_of_a_folder_that_is_not_this_users_nothing_is_loaded(tmp_path, monkeypa
     assert not executables.is_kept(both, told, folder)
     (file,) = folder.iterdir()
     was = file.read_bytes()
-    monkeypatch.setattr(executables, "from_bytes", never)
+    monkeypatch.setattr(executables.pickle, "loads", never)
     again = executables.program(both, told, folder)[0](list(told))
     np.testing.assert_array_equal(first[0], again[0])
     assert file.read_bytes() == was
