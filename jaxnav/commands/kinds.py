@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, cast, get_args
 
 import tyro
-from annotated_types import Ge, Gt, Lt
+from annotated_types import BaseMetadata, Ge, GroupedMetadata, Gt, Lt
 
 from jaxnav.errors import BadInput
 
@@ -79,9 +79,12 @@ def check_values(command: Any) -> None:
     Raises:
         BadInput: names the first flag whose value is out of its range.
     """
+    bounded = [field for field in fields(command) if _is_bounded(field.type)]
+    if not bounded:  # as of `jaxnav stop`, which loads nothing heavy
+        return
     from pydantic import TypeAdapter, ValidationError  # not for --help
 
-    for field in fields(command):
+    for field in bounded:
         try:
             TypeAdapter(cast(Any, field.type)).validate_python(getattr(command, field.name))
         except ValidationError as invalid:
@@ -91,6 +94,14 @@ def check_values(command: Any) -> None:
                 problem = problem.replace(words, plainer)
             got = "" if "got" in problem else f", got {error['input']}"
             raise BadInput(flag_of(field.name), f"{problem}{got}") from None
+
+
+def _is_bounded(kind: Any) -> bool:
+    """Whether a type says more of its values than Python's own."""
+    bounds = getattr(kind, "__metadata__", ())
+    return any(isinstance(one, BaseMetadata | GroupedMetadata | Within) for one in bounds) or any(
+        map(_is_bounded, get_args(kind))
+    )
 
 
 _PLAINER = {
