@@ -19,14 +19,18 @@ from pathlib import Path
 import cv2
 import jax
 import jax.numpy as jnp
+import jaxlie
+import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from jaxnav.core.models.markers import CORNER_SIGNS
+from jaxnav.core.pose import refine
 from jaxnav.core.pose.ippe import PosePair, ippe_square
-from jaxnav.core.pose.refine import solve_marker, solve_markers
+from jaxnav.core.pose.pair_lanes import ippe_squares, solve_pairs
 from jaxnav.files.configuration import configure
 
 SIZE_M, FOCAL_PX, ROUNDS, STEPS = 0.172, 319.0, 15, 12
@@ -75,9 +79,9 @@ def opencv_pairs(corners: np.ndarray, refined: bool) -> tuple[np.ndarray, np.nda
 Task = tuple[Callable[[], object], int]
 
 
-def closed_form(corners: np.ndarray) -> Task:
-    """Our closed form under vmap, compiled."""
-    return _compiled(jax.vmap(ippe_square), corners)
+def closed_form(corners: np.ndarray, batched: bool = True) -> Task:
+    """Our closed form, compiled: the batched one, or the one for one marker under vmap."""
+    return _compiled(ippe_squares if batched else jax.vmap(ippe_square), corners)
 
 
 def _compiled(function: Callable[..., PosePair], corners: np.ndarray) -> Task:
@@ -95,8 +99,32 @@ def single_thread(corners: np.ndarray, refined: bool) -> Task:
 
 def one_by_one(corners: np.ndarray) -> Task:
     """`solve_marker` under vmap, by at most `STEPS` steps."""
-    one = functools.partial(solve_marker, max_steps=STEPS)
+    one = functools.partial(refine.solve_marker, max_steps=STEPS)
     return _compiled(lambda corners, sizes: jax.vmap(one)(corners, sizes), corners)
+
+
+def builtin_lm(corners: np.ndarray) -> Task:
+    """The same minima by optimistix's own solver, as good as it gets."""
+    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
+
+    def one_marker(corners_n: jax.Array, size_m: jax.Array) -> jax.Array:
+        marker = refine._SingleMarker(corners_n, size_m)
+
+        def one_pose(wxyz_xyz: jax.Array) -> jax.Array:
+            chart = marker.chart(jaxlie.SE3(wxyz_xyz[None]))
+            linearised = chart.linearised(marker.rows, jnp.eye(6))
+            solution = optx.least_squares(
+                lambda y, _: linearised(y[:, None])[0][:, 0],
+                solver,
+                jnp.zeros(6),
+                max_steps=STEPS,
+                throw=False,
+            )
+            return chart.transform(solution.value[:, None]).wxyz_xyz[0]
+
+        return jax.vmap(one_pose)(ippe_square(corners_n, size_m).T_camera_marker.wxyz_xyz)
+
+    return _compiled(lambda corners, sizes: jax.vmap(one_marker)(corners, sizes), corners)
 
 
 def medians_us(tasks: dict[str, Task]) -> dict[str, np.ndarray]:
@@ -145,11 +173,11 @@ def quality(noise_px: float) -> dict[str, float]:
     theirs = np.sort(costs_px2(R, shifts, corners), axis=1)
     sizes = np.full(len(corners), SIZE_M)
     ours = our_costs(
-        solve_markers(jnp.asarray(corners, jnp.float32), jnp.asarray(sizes, jnp.float32)),
+        jax.jit(solve_pairs)(jnp.asarray(corners, jnp.float32), jnp.asarray(sizes, jnp.float32)),
         corners,
     )
     with jax.enable_x64(True):
-        polished = our_costs(solve_markers(jnp.asarray(corners), sizes), corners)
+        polished = our_costs(jax.jit(solve_pairs)(jnp.asarray(corners), sizes), corners)
     possible = np.all(np.isfinite(theirs), axis=1)
     worse = np.max(ours / theirs - 1, axis=1)[possible]
     not_yet = np.max(theirs / polished - 1, axis=1)[possible]
@@ -173,10 +201,7 @@ def compile_s() -> dict[str, float]:
     corners = jax.ShapeDtypeStruct((BATCH, 4, 2), jnp.float32)
     sizes = jax.ShapeDtypeStruct((BATCH,), jnp.float32)
     seconds = {}
-    for name, function in (
-        ("ippe_square", jax.vmap(ippe_square)),
-        ("solve_markers", solve_markers),
-    ):
+    for name, function in (("ippe_squares", ippe_squares), ("solve_markers", solve_pairs)):
         jax.clear_caches()
         started = time.perf_counter()
         jax.jit(function).lower(corners, sizes).compile()
@@ -196,13 +221,13 @@ def corners() -> np.ndarray:
     return markers(BATCH, 0.3)
 
 
-@pytest.mark.parametrize("name", ["opencv", "vmap"])
+@pytest.mark.parametrize("name", ["opencv", "vmap", "batched"])
 def test_closed_form(benchmark: BenchmarkFixture, corners: np.ndarray, name: str) -> None:
     """The pair from IPPE."""
     run, benchmark.extra_info["items"] = (
         single_thread(corners[:OPENCV_LANES], refined=False)
         if name == "opencv"
-        else closed_form(corners)
+        else closed_form(corners, name == "batched")
     )
     benchmark(run)
 
@@ -213,8 +238,16 @@ def test_refined(benchmark: BenchmarkFixture, corners: np.ndarray, name: str) ->
     run, benchmark.extra_info["items"] = (
         single_thread(corners[:OPENCV_LANES], refined=True)
         if name == "opencv"
-        else _compiled(solve_markers, corners)
+        else _compiled(solve_pairs, corners)
     )
+    benchmark(run)
+
+
+@pytest.mark.parametrize("name", ["own", "optimistix"])
+def test_general(benchmark: BenchmarkFixture, corners: np.ndarray, name: str) -> None:
+    """`solve_marker` under vmap: our step and optimistix's."""
+    general = one_by_one if name == "own" else builtin_lm
+    run, benchmark.extra_info["items"] = general(corners[:GENERAL_LANES])
     benchmark(run)
 
 
@@ -224,17 +257,19 @@ def main() -> None:
     many = markers(BATCH, 0.3)
     few, some = many[:OPENCV_LANES], many[:GENERAL_LANES]
     before = peak_mib()
-    _compiled(solve_markers, markers(1_000_000, 0.3))[0]()
+    _compiled(solve_pairs, markers(1_000_000, 0.3))[0]()
     memory = peak_mib() - before
     noisy = markers(BATCH, 1.0)
     result = medians_us(
         {
             "OpenCV IPPE_SQUARE": single_thread(few, refined=False),
-            "ippe_square, vmap": closed_form(many),
+            "ippe_square, vmap": closed_form(many, batched=False),
+            "ippe_squares": closed_form(many),
             "OpenCV IPPE_SQUARE + 2 refineLM": single_thread(few, refined=True),
-            "solve_markers": _compiled(solve_markers, many),
-            "solve_markers, 1 px": _compiled(solve_markers, noisy),
+            "solve_markers": _compiled(solve_pairs, many),
+            "solve_markers, 1 px": _compiled(solve_pairs, noisy),
             f"solve_marker, vmap, {STEPS} steps at most": one_by_one(some),
+            "the same by optimistix.LevenbergMarquardt": builtin_lm(some),
         }
     )
     model = _cpu_model()

@@ -58,7 +58,25 @@ class Move(eqx.Module):
     damping: Float[Array, "*N"]  # with which it was solved
 
 
-class NielsenLM(optx.AbstractLeastSquaresSolver):
+class LanewiseSolver(optx.AbstractLeastSquaresSolver):
+    """A solver of many problems at once, whose accepted points are its result."""
+
+    def postprocess(
+        self,
+        fn: Any,
+        y: PyTree,
+        aux: PyTree,
+        args: PyTree,
+        options: dict[str, Any],
+        state: PyTree,
+        tags: frozenset[object],
+        result: optx.RESULTS,
+    ) -> tuple[PyTree, PyTree, dict[str, Any]]:
+        """The accepted points as they are."""
+        return y, aux, {}
+
+
+class NielsenLM(LanewiseSolver):
     """Levenberg-Marquardt with Nielsen's damping.
 
     The function maps y to residuals (m, *N), N problems or a single one, and returns its normal
@@ -144,20 +162,6 @@ class NielsenLM(optx.AbstractLeastSquaresSolver):
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether all problems are done."""
         return jnp.all(state.done), cast(optx.RESULTS, optx.RESULTS.successful)
-
-    def postprocess(
-        self,
-        fn: Any,
-        y: PyTree,
-        aux: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: PyTree,
-        tags: frozenset[object],
-        result: optx.RESULTS,
-    ) -> tuple[PyTree, PyTree, dict[str, Any]]:
-        """The accepted points as they are."""
-        return y, aux, {}
 
 
 def adapted(

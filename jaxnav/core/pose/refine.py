@@ -25,6 +25,7 @@ from jaxnav.core.linalg.levenberg_marquardt import (
     LMState,
     NormalEquations,
     NormalEquationsLM,
+    implicit_root,
 )
 from jaxnav.core.linalg.small_matrices import cholesky, gram, product, solve_lower
 from jaxnav.core.models.geometry import ON_GROUND, rotation_matrix, safe_norm, skew
@@ -32,6 +33,7 @@ from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.ippe import PosePair, ippe_square
 from jaxnav.core.pose.observation import Sightings, sightings
+from jaxnav.core.pose.pair_lanes import solve_pairs
 from jaxnav.core.pose.residuals import (
     Nuisance,
     Rows,
@@ -50,7 +52,6 @@ _PRIOR_SIGMA = 1.0
 # share of it, which float32 can't tell. Of two cameras on one marker it is 1e-4 at most at minima,
 # and more than this in 25 of 29 lanes on the way from one to another, after 12 steps.
 _AT_MINIMUM, _AT_MINIMUM_SHARE = 1e-2, 3e-6
-_BLOCK, _STEPS = 1024, 12  # of `solve_markers`
 
 
 class Candidates(eqx.Module):
@@ -324,58 +325,84 @@ def solve_marker(
     Arguments and result are those of `ippe_square`; `reprojection_error` is the refined one.
     """
     corners_n = jnp.asarray(corners_n)
-    size_m = jnp.asarray(size_m, corners_n.dtype)
-    pairs = _solve_pairs(corners_n[None], size_m[None], max_steps)
-    return jax.tree.map(lambda leaf: leaf[0], pairs)
+    start = ippe_square(corners_n, size_m)
+    marker = _SingleMarker(corners_n, jnp.asarray(size_m, corners_n.dtype))
+    chart = marker.chart(jax.lax.stop_gradient(start.T_camera_marker))
+    free = jnp.eye(6, dtype=corners_n.dtype)
+    T, _ = _minimise(chart, marker.rows, free, jnp.ones(2, bool), max_steps)
+    errors = marker.errors(T)
+    order = jnp.where(errors[0] <= errors[1], jnp.array([0, 1]), jnp.array([1, 0]))
+    return PosePair(jaxlie.SE3(T.wxyz_xyz[order]), errors[order])
+
+
+class _SingleMarker(eqx.Module):
+    """Corners of one marker in one camera, with their residuals at N poses of it."""
+
+    corners_n: Float[Array, "4 2"]
+    size_m: Float[Array, ""]
+
+    def chart(self, T_camera_marker: jaxlie.SE3) -> _Chart:
+        """About the marker's own centre."""
+        corners_m = self.size_m / 2 * jnp.asarray(CORNER_SIGNS, self.corners_n.dtype)
+        return _chart(T_camera_marker, corners_m, jnp.zeros(3, self.corners_n.dtype))
+
+    @property
+    def unit(self) -> Float[Array, ""]:
+        """A hundredth of the marker's spread: a hundred "pixels" across, whatever the units."""
+        offsets = self.corners_n - jnp.mean(self.corners_n, axis=0, keepdims=True)
+        spread = safe_norm(offsets.reshape(-1))
+        return jnp.where(spread > 0, spread, 1) / 100
+
+    @property
+    def rows(self) -> Callable[[Array], Rows]:
+        """Residuals in units, with their derivatives."""
+        return pinhole_rows(self.corners_n, self.unit)
+
+    def errors(self, T_camera_marker: jaxlie.SE3) -> Float[Array, " N"]:
+        """RMS over the eight coordinates, in units of the corners."""
+        chart = self.chart(T_camera_marker)
+        residual, _ = self.rows(chart.arms + chart.pivot[:, None])
+        return self.unit * safe_norm(residual.reshape(8, -1).T) / np.sqrt(8)
 
 
 @jax.jit
 def solve_markers(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -> PosePair:
-    """`solve_marker` for a batch: (B, 4, 2) corners and (B,) sides give axes (B, 2).
+    """`solve_marker` for a batch, by lanes: (B, 4, 2) corners and (B,) sides give axes (B, 2).
 
-    At most `_STEPS` steps, which leave fewer pairs above their minima than OpenCV's refinement.
     A marker's result is the same in every batch. Corners that are not finite give NaN.
     """
-    blocks = -(-corners_n.shape[0] // _BLOCK)
-    more = blocks * _BLOCK - corners_n.shape[0]
-    corners = jnp.pad(corners_n, ((0, more), (0, 0), (0, 0))).reshape(blocks, _BLOCK, 4, 2)
-    sizes = jnp.pad(size_m, (0, more), constant_values=1).reshape(blocks, _BLOCK)
-    pairs = jax.lax.map(lambda block: _solve_pairs(block[0], block[1], _STEPS), (corners, sizes))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: corners_n.shape[0]], pairs)
+    return _solve_pairs(corners_n, size_m)
 
 
-def _solve_pairs(
-    corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"], max_steps: int
-) -> PosePair:
-    """Both poses of B markers, refined side by side in units of half their sides."""
-    dtype, count = corners_n.dtype, corners_n.shape[0]
-    usable = jnp.all(jnp.isfinite(corners_n), axis=(1, 2)) & jnp.isfinite(size_m)
-    corners_n = jnp.where(usable[:, None, None], corners_n, 0)
-    start = jax.vmap(ippe_square, in_axes=(0, None))(corners_n, 2.0).T_camera_marker
-    both = jaxlie.SE3(jnp.swapaxes(start.wxyz_xyz, 0, 1).reshape(-1, 7))
-    # A hundredth of the marker's spread: a hundred "pixels" across, whatever the units.
-    offsets = corners_n - jnp.mean(corners_n, axis=1, keepdims=True)
-    spread = safe_norm(offsets.reshape(count, 8))
-    unit = jnp.tile(jnp.where(spread > 0, spread, 1) / 100, 2)
-    rows = pinhole_rows(jnp.tile(jnp.moveaxis(corners_n, 0, -1), 2), unit)
+_solve_pairs = jax.custom_jvp(solve_pairs)
 
-    def chart(T: jaxlie.SE3) -> _Chart:
-        return _chart(T, jnp.asarray(CORNER_SIGNS, dtype), jnp.zeros(3, dtype))
 
-    free = jnp.eye(6, dtype=dtype)
-    stopped = chart(jax.lax.stop_gradient(both))
-    T, _ = _minimise(stopped, rows, free, jnp.tile(usable, 2), max_steps)
-    found = chart(T)
-    residual, _ = rows(found.arms + found.pivot[:, None])
-    errors = unit * safe_norm(residual.reshape(8, -1).T) / np.sqrt(8)
-    errors = jnp.where(usable[:, None], errors.reshape(2, count).T, jnp.nan)
-    half_m = size_m[:, None, None] / 2
-    wxyz, xyz = T.wxyz_xyz[:, :4], T.wxyz_xyz[:, 4:]
-    wxyz, xyz = (jnp.swapaxes(part.reshape(2, count, -1), 0, 1) for part in (wxyz, xyz))
-    wxyz_xyz = jnp.concatenate([wxyz, half_m * xyz], axis=-1)
-    wxyz_xyz = jnp.where(usable[:, None, None], wxyz_xyz, jnp.nan)
-    swapped = ~(errors[:, :1] <= errors[:, 1:])
-    return PosePair(
-        jaxlie.SE3(jnp.where(swapped[..., None], wxyz_xyz[:, ::-1], wxyz_xyz)),
-        jnp.where(swapped, errors[:, ::-1], errors),
+@_solve_pairs.defjvp
+def _solve_pairs_jvp(
+    primals: tuple[Array, Array], tangents: tuple[Array, Array]
+) -> tuple[PosePair, PosePair]:
+    """Derivatives by the implicit function theorem, as those of `solve_marker`."""
+    pair = _solve_pairs(*primals)
+    wxyz_xyz = pair.T_camera_marker.wxyz_xyz
+    _, (t_poses, t_errors) = jax.jvp(
+        lambda *seen: jax.vmap(_at_minima)(wxyz_xyz, *seen), primals, tangents
     )
+    return pair, PosePair(jaxlie.SE3(t_poses), t_errors)
+
+
+def _at_minima(
+    wxyz_xyz: Float[Array, "2 7"], corners_n: Array, size_m: Array
+) -> tuple[Array, Array]:
+    """Refined poses and their errors, with the derivatives of minima by corners and size."""
+    T = jaxlie.SE3(jax.lax.stop_gradient(wxyz_xyz))
+    marker = _SingleMarker(corners_n, size_m)
+    here = jnp.zeros((6, 2), wxyz_xyz.dtype)
+    y = implicit_root(here, (T, marker), gradient=_gradient_of_marker, residual=None)
+    moved = marker.chart(T).transform(y)
+    return moved.wxyz_xyz, marker.errors(moved)
+
+
+def _gradient_of_marker(y: Array, _: None, inputs: tuple[jaxlie.SE3, _SingleMarker]) -> Array:
+    T, marker = inputs
+    linearised = marker.chart(T).linearised(marker.rows, jnp.eye(6, dtype=y.dtype))
+    return linearised(y)[1].gradient

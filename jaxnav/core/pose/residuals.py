@@ -175,13 +175,12 @@ def reprojection_rows(rig: CameraRig, seen: Sightings) -> Callable[[Float[Array,
 
 
 def pinhole_rows(
-    corners_n: Float[Array, "P 2 *N"], unit: Float[Array, "*N"]
+    corners_n: Float[Array, "P 2"], unit: Float[Array, ""]
 ) -> Callable[[Float[Array, "3 P N"]], Rows]:
     """As `reprojection_rows` for a camera of focal length 1, in multiples of `unit`.
 
     Args:
-        corners_n: (P, 2) observed corners, normalised image coordinates; of each problem its own
-            with an axis (N,) at the end.
+        corners_n: (P, 2) observed corners, normalised image coordinates.
         unit: in which residuals are counted.
 
     Returns:
@@ -190,8 +189,7 @@ def pinhole_rows(
 
     def rows(points: Array) -> Rows:
         image, slope = image_of("none", points, jnp.zeros(MOST_COEFFICIENTS, points.dtype))
-        seen = jnp.swapaxes(corners_n.reshape(*corners_n.shape[:2], -1), 0, 1)
-        return (image - seen) / unit, slope / unit
+        return (image - corners_n.T[..., None]) / unit, slope / unit
 
     return rows
 

@@ -1,17 +1,20 @@
-"""Both poses of many markers against those of one."""
+"""The lane-parallel solver of marker poses against the general one, lane by lane."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 from jaxnav.core.models.markers import CORNER_SIGNS
-from jaxnav.core.pose import refine
+from jaxnav.core.pose import pair_lanes
+from jaxnav.core.pose.ippe import ippe_square
 from jaxnav.core.pose.refine import solve_marker, solve_markers
 from tests import worlds
 
 BATCH, FOCAL_PX = 64, 500.0
 general = jax.jit(jax.vmap(solve_marker))
+closed = jax.jit(pair_lanes.ippe_squares)
 
 
 def views() -> tuple[np.ndarray, np.ndarray]:
@@ -55,6 +58,24 @@ def costs_of(pair, corners: np.ndarray, size: np.ndarray) -> np.ndarray:
     ) + np.asarray(T[..., None, 4:], float)
     projected = points[..., :2] / points[..., 2:]
     return np.sum((projected - corners[:, None]) ** 2, axis=(2, 3))
+
+
+def test_the_closed_form_is_that_of_one_marker(precision):
+    corners, size = views()
+    corners, size = jnp.asarray(corners, precision), jnp.asarray(size, precision)
+    pair, expected = closed(corners, size), jax.jit(jax.vmap(ippe_square))(corners, size)
+    assert pair.reprojection_error.dtype == precision
+    eps = jnp.finfo(precision).eps
+    apart = np.abs(pair.reprojection_error - expected.reprojection_error)
+    assert np.max(apart / np.max(np.abs(corners), axis=(1, 2))[:, None]) < 4 * eps
+    clear = np.asarray(expected.reprojection_error[:, 1] > 1.01 * expected.reprojection_error[:, 0])
+    clear = clear & (np.arange(BATCH) < 40)
+    assert np.sum(clear) > 20
+    angles = worlds.rotation_angles_rad(
+        np.asarray(pair.T_camera_marker.rotation().as_matrix(), float)[clear],
+        np.asarray(expected.T_camera_marker.rotation().as_matrix(), float)[clear],
+    )
+    assert np.max(angles) < 100 * eps
 
 
 def test_every_lane_reaches_the_minima_of_one_marker(precision):
@@ -118,16 +139,20 @@ def test_a_lane_does_not_know_how_many_there_are(batch):
 
 
 def test_blocks_do_not_show(monkeypatch):
-    """Many blocks with a part of one at the end give what one block gives; none, nothing."""
+    """Many blocks with a part of one at the end give what one block gives."""
     corners, size = map(jnp.asarray, views())
     whole = jax.tree.leaves(solve_markers(corners, size))
-    monkeypatch.setattr(refine, "_BLOCK", 24)
-    split = jax.tree.leaves(jax.jit(lambda *a: solve_markers.__wrapped__(*a))(corners, size))
+    monkeypatch.setattr(pair_lanes, "_block_lanes", lambda *_: 24)
+    split = jax.tree.leaves(jax.jit(lambda *a: pair_lanes.solve_pairs(*a))(corners, size))
     for of_all, of_part in zip(whole, split, strict=True):
-        np.testing.assert_allclose(of_all, of_part, rtol=1e-12, atol=1e-12)
-    pair = solve_markers(jnp.zeros((0, 4, 2)), jnp.zeros(0))
-    assert pair.T_camera_marker.wxyz_xyz.shape == (0, 2, 7)
-    assert pair.reprojection_error.shape == (0, 2)
+        np.testing.assert_array_equal(of_all, of_part)
+
+
+def test_an_empty_batch():
+    for function in (solve_markers, pair_lanes.ippe_squares):
+        pair = function(jnp.zeros((0, 4, 2)), jnp.zeros(0))
+        assert pair.T_camera_marker.wxyz_xyz.shape == (0, 2, 7)
+        assert pair.reprojection_error.shape == (0, 2)
 
 
 def test_gradients_are_those_of_one_marker_and_differences():
@@ -159,3 +184,16 @@ def test_gradients_are_those_of_one_marker_and_differences():
     for mine, general_one in zip(ours, theirs, strict=True):
         apart = np.abs(mine - general_one).reshape(BATCH, -1)
         assert np.max(apart[fair] / scale[fair, None]) < 1e-5
+
+
+def test_the_driver_is_optimistix(monkeypatch):
+    solvers = []
+    original = optimistix.least_squares
+
+    def spy(fn, solver, *args, **kwargs):
+        solvers.append(type(solver))
+        return original(fn, solver, *args, **kwargs)
+
+    monkeypatch.setattr(optimistix, "least_squares", spy)
+    jax.eval_shape(pair_lanes.solve_pairs, jnp.zeros((4, 4, 2)), jnp.ones(4))
+    assert set(solvers) == {pair_lanes.LaneLM}
