@@ -7,7 +7,6 @@ Nelder-Mead and CMA-ES on one loss; `cost` holds gradients against forward passe
 """
 
 import argparse
-import dataclasses
 import functools
 import itertools
 import json
@@ -219,8 +218,6 @@ def cost_table(out: Path) -> None:
 
     args = TuneController(headless=True)
     loop = closed_loop(args, args.scenario)
-    rollout = dataclasses.replace(loop.rollout, many=loop.many, many_lanes=loop.many_lanes)
-    loop = dataclasses.replace(loop, rollout=rollout)
     space = gains_of(args, loop.rollout.navigator)
     keys = jax.vmap(jax.random.key)(jnp.arange(args.seeds))
     _print_cost(
