@@ -150,7 +150,7 @@ def test_a_real_photograph(data_dir, tmp_path, capsys):
         (("{tmp}/text.png", *CAMERA), "text.png: is not an image"),
         (("{tmp}/empty.png", *CAMERA), "empty.png: is not an image"),
         (("{tmp}/small.png", *CAMERA), "is 64 x 48 pixels, but --camera"),
-        (("{tmp}/small.png", *CAMERA[:4], "--marker-size-m", "0"), "--marker-size-m: must be pos"),
+        (("{tmp}/small.png", *CAMERA[:4], "--marker-size-m", "0"), "--marker-size-m: must be from"),
         (("{tmp}/small.png", *CAMERA[:4], "--marker-size-m", "x"), "--marker-size-m"),
         (("{tmp}/small.png", *CAMERA[:2], *CAMERA[4:]), "front"),
         (("{tmp}/small.png", *CAMERA, "--family", "tag99h1"), "tag99h1"),

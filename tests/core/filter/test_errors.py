@@ -21,7 +21,7 @@ from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import ON_GROUND, T_world_vehicle_from_planar, cayley
 from jaxnav.core.models.rig import PLACED_BY_HAND
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.observation import Observation, Snapshot
+from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.residuals import camera_slopes, reprojection_rows
 from tests import worlds
 
@@ -29,7 +29,6 @@ SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
 SLIP_SIGMA = 0.05
 VIEW = worlds.OVERLAP_VIEW  # two cameras see the marker
 PLANAR = jnp.asarray(ON_GROUND, float)
-NOTHING = Observation(jnp.zeros((4, 1, 4, 2)), jnp.zeros((4, 1), bool))
 
 
 def off_rig():
@@ -137,8 +136,8 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
 
     # The rest of the state, by the joint Gaussian of all of it.
     posterior = jax.tree.map(lambda leaf: leaf[0], fit.posterior)
-    offer = eqx.filter_jit(navigator.motion.follow)(
-        jax.tree.map(lambda leaf: leaf[0], bank), posterior, obs
+    offer = eqx.filter_jit(navigator.motion.offer)(
+        jax.tree.map(lambda leaf: leaf[0], bank), posterior
     )
     mean, covariance = map(np.asarray, offer.posterior)
     np.testing.assert_allclose(mean[SENSORS_END:] - bank.mean[0, SENSORS_END:], y[3:], atol=1e-4)
@@ -476,9 +475,7 @@ def test_a_body_that_moves_freely_learns_how_cameras_differ_and_not_how_they_tur
         valid=jnp.asarray(True),
         errors=errors,
     )
-    mean, P = jax.jit(ConstantVelocity.follow)(
-        navigator.motion, before, measured, NOTHING
-    ).posterior
+    mean, P = jax.jit(ConstantVelocity.offer)(navigator.motion, before, measured).posterior
     alike = np.zeros((4, EACH, EACH))
     alike[seen] = np.eye(EACH) / np.sqrt(2)
     alike = alike.reshape(4 * EACH, EACH)
