@@ -407,9 +407,8 @@ def test_derivatives():
     located, dt_s = jnp.asarray(True), jnp.asarray(0.1)
 
     def outcome(pose, steering_rad, floats):
-        state, command, _, _ = eqx.combine(floats, control)(
-            control.init(), pose, located, steering_rad, dt_s
-        )
+        given = ControlInput(pose, located, steering_rad, dt_s)
+        state, command, _, _ = eqx.combine(floats, control)(control.init(), given)
         return command.steering_rad, command.throttle, state.integral_ms
 
     pose = jnp.asarray([2.5, -0.5, 2.3])

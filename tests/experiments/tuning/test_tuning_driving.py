@@ -355,7 +355,8 @@ def test_the_soft_switch_has_finite_derivatives_wherever_the_car_is(precision, v
         soft = SoftController(controller, softness_m)
         state, total = soft.init(), jnp.zeros((), precision)
         for _ in range(3):
-            state, command, _, log = soft(state, pose, jnp.asarray(True), steering_rad, dt_s)
+            given = ControlInput(pose, jnp.asarray(True), steering_rad, dt_s)
+            state, command, _, log = soft(state, given)
             total = total + sum(jax.tree.leaves(command)) + log.alpha_rad
         return total + jnp.sum(state.integrals_ms) + state.shares[-1]
 
