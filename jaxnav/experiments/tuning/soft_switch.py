@@ -58,14 +58,10 @@ class SoftController(eqx.Module):
         return SoftState(hard.waypoint_index, zero, zero, zero, shares, zeros, zeros, commands)
 
     def __call__(
-        self, state: SoftState, *sensed: Any
+        self, state: SoftState, given: ControlInput
     ) -> tuple[SoftState, Command | TwistCommand, Bool[Array, ""], ControlLog]:
-        """Control as the controller does; the log is that of the waypoint with the largest share.
-
-        Args:
-            sensed: the fields of a `ControlInput`.
-        """
-        control, given = self.controller, ControlInput(*sensed)
+        """Control as the controller does; the log is that of the waypoint with the largest share."""
+        control = self.controller
         waypoints = jnp.arange(control.waypoints_m.shape[0])
         short_m = jax.vmap(lambda index: control.short_of(index, given.pose))(waypoints)
         leaves = jnp.where(given.located & given.decided, _beyond(-short_m, self.softness_m), 0)
