@@ -60,7 +60,7 @@ class SoftController(eqx.Module):
     def __call__(
         self, state: SoftState, given: ControlInput
     ) -> tuple[SoftState, Command | TwistCommand, Bool[Array, ""], ControlLog]:
-        """Control as the controller does; the log is that of the waypoint with the largest share."""
+        """Control as the controller does; the log is of the waypoint with the largest share."""
         control = self.controller
         waypoints = jnp.arange(control.waypoints_m.shape[0])
         short_m = jax.vmap(lambda index: control.short_of(index, given.pose))(waypoints)

@@ -22,6 +22,7 @@ from jaxnav.experiments.tuning.driving import ClosedLoop, without_gradient
 from jaxnav.experiments.tuning.soft_switch import SoftController, SoftState, soften_switch
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.sim.plant import CarState, OdometryNoise
+from jaxnav.sim.queue import Slots
 from jaxnav.sim.rollout import Rollout
 from jaxnav.sim.scenarios import Scenario, scenarios
 from jaxnav.sim.world import Spread, nominal
@@ -205,8 +206,9 @@ def test_a_long_drive_needs_no_more_memory(tame):
     space = space_of(tame)
     rollout = dataclasses.replace(tame.rollout, scenario=scenario(duration_s=67.0))
     closed = dataclasses.replace(tame, rollout=rollout)
-    drives = closed._start(space.start, space, keys(jnp.arange(1)))
-    program = ClosedLoop._advance.lower(closed, space.start, space, drives).compile().compiled
+    asked = closed, space.start, space
+    drives = driving._start(*asked, jax.random.key_data(keys(jnp.arange(1))))
+    program = driving._advance.jitted.lower(*asked, drives, Slots(1)).compile()
     assert rollout.scenario.frames > 1000
     assert program.memory_analysis().temp_size_in_bytes < 2**20
 
