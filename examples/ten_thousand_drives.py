@@ -37,7 +37,7 @@ def main(
         """One drive: whether it passed all waypoints, and whether it began wrong."""
 
         def frame(world, _):
-            world, trace = rollout.frame(world, navigator.step)
+            world, trace, _ = rollout.frame(world, navigator.step)
             return world, (trace.decided, wrap_angle(trace.pose[2] - trace.true_pose[2]))
 
         first = rollout.first(key)
