@@ -38,7 +38,8 @@ _NAME = re.compile(r"[0-9a-f]{64}\.step")
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 # Rooms that only call compiled programs or draw their results.
 _WITHOUT = (
-    "calibrate", "commands", "experiments", "pictures", "recordings/other", "vehicles/conformance",
+    "calibrate", "commands", "experiments/studies", "pictures", "recordings/other",
+    "vehicles/conformance",
 )  # fmt: skip
 PACKAGE = Path(__file__).resolve().parents[1]
 ASKED = "/jaxnav/executables/asked"  # JAX's listeners hear of it as of a compilation
