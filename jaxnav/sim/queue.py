@@ -88,13 +88,10 @@ def program_sizes(navigator: Navigator, drives: int) -> list[Slots]:
     whole = Slots(min(drives, 16))
     if drives <= _FEW or type(navigator) is not Navigator:
         return [whole]
-    sizes = [Slots(64, 1, 2), Slots(32, 2, 8)]
-    if not isinstance(navigator.selector, MultiHypothesis):
-        sizes = [Slots(64, 1)]
-    sightings = navigator.no_candidates().valid.shape[0] / 2
-    return [size for size in sizes if (size.sightings or 0) < sightings or size.hypotheses] + [
-        whole
-    ]
+    if isinstance(navigator.selector, MultiHypothesis):
+        return [Slots(64, 1, 2), Slots(32, 2, 8), whole]
+    several = navigator.no_candidates().valid.shape[0] > 2  # two candidates a sighting
+    return [Slots(64, 1), whole] if several else [whole]
 
 
 def run_drives(
