@@ -73,7 +73,9 @@ def recorded() -> FrameSequences:
         scenarios()["paper"], start_pose=(0.9, -0.6, 2.2), start_spread=(0.0,) * 3,
         frame_period_s=0.2, duration_s=0.2 * FRAMES - 0.1,
     )  # fmt: skip
-    rollout = Rollout(Drives(throttle=0.06, steering_rad=0.25), CAR, MARKERS, scenario, SIGMA_PX)
+    rollout = Rollout(
+        Drives(throttle=0.06, steering_rad=0.25, rig=RIG), CAR, MARKERS, scenario, SIGMA_PX
+    )
     return simulate_sequences(rollout, jax.vmap(jax.random.key)(jnp.arange(3)))
 
 
