@@ -6,11 +6,12 @@ import warnings
 
 import jax
 
-from jaxnav.files.configuration import configure, jax_runs
+from jaxnav.files.configuration import configure, jax_runs, step_folder
+from jaxnav.files.executables import keep_in
 
 
 def configure_jax(float64: bool, threads: int | None = None) -> None:
-    """Call `jaxnav.configure` for a command, before it builds an array.
+    """Call `jaxnav.configure` for a command, before it builds an array, and keep what it compiles.
 
     A command that is called inside a process that computes already, as tests do, takes that process
     as it is, without a warning.
@@ -24,6 +25,7 @@ def configure_jax(float64: bool, threads: int | None = None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         configure(float64=float64, threads=threads)
+    keep_in(step_folder())
 
 
 def collect_garbage_rarely() -> None:

@@ -10,16 +10,18 @@ loading an executable. So the executable itself is kept.
 """
 
 import hashlib
+import inspect
 import os
 import pickle
 import platform
 import re
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, update_wrapper
+from functools import cache, partial, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -33,14 +35,11 @@ from jaxtyping import PyTree
 
 from jaxnav.files.private import NotPrivateError, PrivateFolder
 
-_KEPT = 64  # the last used executables, some MB each, are kept
+_KEPT = 128  # the last used executables, some MB each, are kept
 _NAME = re.compile(r"[0-9a-f]{64}\.step")
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
-# Rooms that only call compiled programs or draw their results.
-_WITHOUT = (
-    "calibrate", "commands", "experiments/studies", "pictures", "recordings/other",
-    "vehicles/conformance",
-)  # fmt: skip
+# Rooms that only call compiled programs or draw their results. A function's own file counts always.
+_WITHOUT = "calibrate", "commands", "experiments/studies", "pictures", "vehicles/conformance"
 PACKAGE = Path(__file__).resolve().parents[1]
 ASKED = "/jaxnav/executables/asked"  # JAX's listeners hear of it as of a compilation
 
@@ -62,27 +61,53 @@ def keep_in(folder: Path | None) -> None:
 
 
 class kept:
-    """`jax.jit` of one of jaxnav's own functions of arrays and trees, with a kept executable."""
+    """`jax.jit` of one of jaxnav's own functions of arrays and trees, with a kept executable.
+
+    Parameters that are given by keyword alone are static.
+    """
 
     def __init__(self, function: Callable[..., PyTree]):
-        self.jitted = jax.jit(function)
+        parameters = inspect.signature(function).parameters.values()
+        static = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
+        self.jitted = jax.jit(function, static_argnames=static)
         self._function = function
-        self._ready: dict[Hashable, tuple[Run, PyTreeDef] | None] = {}
+        self._ready: dict[Hashable, Callable[..., PyTree]] = {}
         update_wrapper(self, function)
 
-    def __call__(self, *arguments: PyTree, **named: PyTree) -> PyTree:
+    def __call__(self, *arguments: PyTree, **static: Hashable) -> PyTree:
+        if not _folders or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
+            return self.jitted(*arguments, **static)
+        return self.load(*arguments, **static)(*arguments)
+
+    def load(self, *arguments: PyTree, **static: Hashable) -> Callable[..., PyTree]:
+        """The executable for arguments of these shapes, which are all that it takes. Nothing runs.
+
+        Loaded if another process has kept it, else compiled and kept.
+        """
+        if not _folders:
+            return self.jitted.lower(*arguments, **static).compile()
         leaves, given = jax.tree.flatten(arguments)
-        if not _folders or named or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
-            return self.jitted(*arguments, **named)
-        kind = given, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+        kind = given, *static.items(), *((np.shape(x), jnp.result_type(x)) for x in leaves)
         if kind not in self._ready:
-            ours = all_ours(arguments)
-            self._ready[kind] = program(self._function, arguments, _folders[-1]) if ours else None
-        ready = self._ready[kind]
-        if ready is None:
-            return self.jitted(*arguments)
-        run, structure = ready
+            self._ready[kind] = partial(self.jitted, **static)
+            if all_ours(arguments):
+                self._ready[kind] = _call(
+                    *program(self._function, arguments, _folders[-1], static),
+                    [jnp.result_type(leaf) for leaf in leaves],
+                )
+        return self._ready[kind]
+
+
+def _call(run: Run, structure: PyTreeDef, types: list[np.dtype]) -> Callable[..., PyTree]:
+    def call(*arguments: PyTree) -> PyTree:
+        # Plain numbers among the leaves become arrays.
+        leaves = [
+            leaf if hasattr(leaf, "dtype") else np.asarray(leaf, dtype)
+            for leaf, dtype in zip(jax.tree.leaves(arguments), types, strict=True)
+        ]
         return jax.tree.unflatten(structure, run(leaves))
+
+    return call
 
 
 def all_ours(tree: PyTree) -> bool:
@@ -100,7 +125,10 @@ def all_ours(tree: PyTree) -> bool:
 
 
 def program(
-    function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path
+    function: Callable[..., PyTree],
+    arguments: tuple[PyTree, ...],
+    folder: Path,
+    static: Mapping[str, Hashable] = MappingProxyType({}),
 ) -> tuple[Run, PyTreeDef]:
     """The executable of a function on its arguments' leaves, and the structure of its result.
 
@@ -108,15 +136,16 @@ def program(
     """
     jax.monitoring.record_event(ASKED)
     given, inputs = _asked(arguments)
-    name = _file(_name(function, given), inputs)
-    return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)
+    name = _file(_name(function, given, static), inputs)
+    bound = partial(function, **static)
+    return _loaded(folder, name, inputs) or _compiled(bound, folder, name, given, inputs)
 
 
 def is_kept(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path) -> bool:
     """Whether `program` finds the executable in the folder."""
     given, inputs = _asked(arguments)
     with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
-        return files.holds(_file(_name(function, given), inputs))
+        return files.holds(_file(_name(function, given, {}), inputs))
     return False
 
 
@@ -137,8 +166,10 @@ def _asked(arguments: tuple[PyTree, ...]) -> tuple[PyTreeDef, list[jax.ShapeDtyp
     return given, jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
 
 
-def _name(function: Callable[..., PyTree], given: PyTreeDef) -> str:
-    return str((f"{function.__module__}.{function.__qualname__}", given))
+def _name(function: Callable[..., PyTree], given: PyTreeDef, static: Mapping[str, Hashable]) -> str:
+    own = Path(inspect.getfile(function)).read_bytes()
+    digest = hashlib.blake2b(own, digest_size=8).hexdigest()
+    return str((f"{function.__module__}.{function.__qualname__}", digest, given, *static.items()))
 
 
 def _compiled(

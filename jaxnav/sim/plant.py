@@ -60,7 +60,7 @@ class OdometryNoise(eqx.Module):
     ) -> Float[Array, ""] | float:
         """A drive's scale of the speed, or that of these errors, with what spinning adds."""
         speed_scale = self.speed_scale if speed_scale is None else speed_scale
-        return speed_scale * self.scale_at(stamp_s) if self.spin else speed_scale
+        return speed_scale * self.scale_at(stamp_s)
 
 
 def move_car(

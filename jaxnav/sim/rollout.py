@@ -70,11 +70,9 @@ class Rollout(eqx.Module):
     navigator: Navigator
     vehicle: Vehicle | TwistBase
     markers: MarkerMap
-    scenario: Scenario = eqx.field(static=True)
+    scenario: Scenario
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    corner_drift_px: Float[Array, ""] | None = None  # None: the scenario's
-    start_pose: Float[Array, " 3"] | None = None  # None: the scenario's
-    spread: Spread | None = eqx.field(static=True, default=None)  # None: all cars are nominal
+    spread: Spread | None = None  # None: all cars are nominal
     chunk_frames: int = eqx.field(static=True, default=15)
 
     def run(
@@ -101,10 +99,12 @@ class Rollout(eqx.Module):
             like: with the programs for so many drives, and so with their bits; by default those of
                 `keys`.
         """
+        # All that the spread decides is in a drive's start.
+        under_way = dataclasses.replace(self, spread=None)
         traces = run_drives(
             keys,
             lambda keys: _start(self, jax.random.key_data(keys)),
-            lambda worlds, slots: _advance(self, keep, worlds, slots),
+            lambda worlds, slots: _advance(under_way, keep, worlds, slots),
             program_sizes(self.navigator, like or len(keys)),
             DriveTraces(len(keys), self.chunk_frames),
             os.cpu_count() or 1,
@@ -122,8 +122,7 @@ class Rollout(eqx.Module):
         scenario = self.scenario
         key, start_key, rig_key = jax.random.split(key, 3)
         spread = jnp.asarray(scenario.start_spread)
-        start_pose = scenario.start_pose if self.start_pose is None else self.start_pose
-        start = jnp.asarray(start_pose) + spread * jax.random.uniform(
+        start = jnp.asarray(scenario.start_pose) + spread * jax.random.uniform(
             start_key, (3,), spread.dtype, -1, 1
         )
         corners = (len(self.navigator.rig), len(self.markers.ids), 4, 2)
@@ -206,8 +205,7 @@ class Rollout(eqx.Module):
         drift = drifted(
             world.drift, scenario.corner_correlation, jax.random.fold_in(key_corners, 1)
         )
-        given_px = self.corner_drift_px
-        noise_px = noise_px + drift * (scenario.corner_drift_px if given_px is None else given_px)
+        noise_px = noise_px + drift * scenario.corner_drift_px
         visible = visible & ~scenario.hidden(stamp_s)
         corners_px = jnp.where(visible[..., None, None], corners_px + noise_px, 0)
         dt_s = jnp.where(moves, period_s, 0)
@@ -258,7 +256,7 @@ class Rollout(eqx.Module):
             done=out.done,
         )
         command = standing(self.vehicle, x_m.dtype)
-        if isinstance(command, TwistCommand) and scenario.turns_radps:
+        if isinstance(command, TwistCommand):
             turn = jnp.full_like(command.turn_radps, scenario.turns_radps)
             command = dataclasses.replace(command, turn_radps=turn)
         if out.command is not None and scenario.drives:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any
 
 import equinox as eqx
@@ -19,9 +19,10 @@ HEADING_SIGMA_RAD = 0.05  # noise of the compass heading given to `OrientationGi
 _LAP_M = ((1.2, -0.2), (0.0, 0.6), (-1.2, -0.2), (0.0, -1.2))  # counter-clockwise, marker in view
 
 
-@dataclass(frozen=True)
-class Scenario:
+class Scenario(eqx.Module):
     """A drive and its disturbances, which the navigator is not told.
+
+    Numbers are leaves: scenarios with as many waypoints share a program.
 
     The `told_...` fields are what it is told: how far the car's cameras may be from level and from
     their calibration, zero where they are exact.
@@ -33,7 +34,7 @@ class Scenario:
     waypoints_m: tuple[tuple[float, float], ...]
     start_pose: tuple[float, float, float]  # x_m, y_m, psi_rad
     start_spread: tuple[float, float, float] = (0.1, 0.1, float(np.deg2rad(10.0)))  # uniform, +-
-    drives: bool = True  # False: parked
+    drives: bool = eqx.field(static=True, default=True)  # False: parked
     duration_s: float = 40.0
     frame_period_s: float = 1 / 15  # the paper's cluster captures and detects at 15 Hz
     latency_s: float = 0.03  # from the stamp of a frame until its command acts
@@ -43,7 +44,8 @@ class Scenario:
     kidnapped_s: float = np.inf  # when the car is displaced
     kidnapped_by: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad, in the world
     extrinsics_off: tuple[float, float] = (0.0, 0.0)  # rad, m; each camera in its own direction
-    as_told: bool = False  # cameras and sensors are off by what their files tell, anew each drive
+    # Cameras and sensors are off by what their files tell, anew each drive.
+    as_told: bool = eqx.field(static=True, default=False)
     told_tilt_sigma_rad: float = 0.0
     told_height_sigma_m: float = 0.0
     corner_lag_s: float = 0.0  # corners lie where they were this long before the stamp
@@ -52,7 +54,9 @@ class Scenario:
     corner_correlation: float = 0.95  # from frame to frame; 1: constant through a drive
     gyro_late_s: float = 0.0  # a gyro's readings are later by this than it is told
     turns_radps: float = 0.0  # parked, a base that is no car turns on the spot
-    scored_after_s: tuple[float, ...] = ()  # errors of the frames from then on count apart, too
+    # Errors of the frames from then on count apart, too.
+    scored_after_s: tuple[float, ...] = eqx.field(static=True, default=())
+    frames: int = eqx.field(init=False)  # of the longest drive
 
     def __post_init__(self) -> None:
         if not 0 <= self.corner_lag_s <= self.frame_period_s:
@@ -62,11 +66,7 @@ class Scenario:
             )
         if not 0 <= self.corner_correlation <= 1:
             raise ValueError(f"corner_correlation must be in [0, 1], got {self.corner_correlation}")
-
-    @property
-    def frames(self) -> int:
-        """The number of frames of the longest drive."""
-        return int(np.ceil(self.duration_s / self.frame_period_s))
+        self.frames = int(np.ceil(self.duration_s / self.frame_period_s))
 
     def hidden(self, stamp_s: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether all markers are hidden at a time."""
@@ -86,8 +86,6 @@ class Scenario:
         if self.as_told:
             return _off_as_told(rig, key)
         turn_rad, shift_m = self.extrinsics_off
-        if turn_rad == 0 and shift_m == 0:
-            return rig
         directions = jax.random.normal(key, (len(rig), 2, 3), rig.cameras.focal_px.dtype)
         directions = directions / jnp.linalg.norm(directions, axis=2, keepdims=True)
         xi = jnp.concatenate([shift_m * directions[:, 0], turn_rad * directions[:, 1]], axis=1)

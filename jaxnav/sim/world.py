@@ -1,7 +1,6 @@
 """Hold the state of one drive of a rollout, and the true car that its seed drew."""
 
 import dataclasses
-from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -40,8 +39,7 @@ class Truth(eqx.Module):
         )
 
 
-@dataclass(frozen=True)
-class Spread:
+class Spread(eqx.Module):
     """The ranges (low, high) from which each drive's true car is drawn uniformly.
 
     The first three are factors on the vehicle's or the scenario's own numbers, the first one a

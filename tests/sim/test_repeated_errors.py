@@ -55,12 +55,12 @@ def test_corners_drift_as_a_gauss_markov_process_each_for_itself():
 def test_corners_lie_off_by_the_drift():
     rollout = Rollout(Spy(told=corner_x_px), CAR, MARKERS, aside(), 0.0)
     exact, _ = rollout.run_keeping(keys(SEEDS), Drift())
-    given = dataclasses.replace(rollout, corner_drift_px=jnp.asarray(0.5))
+    given = dataclasses.replace(rollout, scenario=aside(corner_drift_px=0.5))
     shown, drift = given.run_keeping(keys(SEEDS), Drift())
     off_px = shown.flip_probability - exact.flip_probability
     np.testing.assert_allclose(off_px, 0.5 * drift[:, :, LEFT, 0, 0, 0], atol=1e-9)
     assert np.ptp(off_px) > 0.5
-    # The scenario's own, where none is given; fully correlated, it stays.
+    # Fully correlated, it stays.
     own = run(Spy(told=corner_x_px), aside(corner_drift_px=0.5, corner_correlation=1.0))
     off_px = own.flip_probability - exact.flip_probability
     np.testing.assert_allclose(off_px, off_px[:, :1].repeat(15, axis=1), atol=1e-9)

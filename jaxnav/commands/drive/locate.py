@@ -30,8 +30,8 @@ from jaxnav.detection.families import LARGEST_FAMILIES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.cameras import load_camera_entry
+from jaxnav.files.executables import kept
 from jaxnav.files.images import MIRRORED, read_photograph
-from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 
 _FREEDOM = 2  # of a marker's eight numbers: a pose has six
 _CLOSER_LOOKS = 400
@@ -137,7 +137,7 @@ def _cameras(camera: Camera, lens_sigma_px: np.ndarray | None) -> list[Camera]:
     ]
 
 
-@jax.jit
+@kept
 def _solve(rig: CameraRig, markers: MarkerMap, obs: Observation) -> tuple[Candidates, jax.Array]:
     """Both poses of one marker, and the probability that the better one is the mirror image."""
     snapshot = Snapshot.create(rig, markers, obs)
@@ -331,7 +331,7 @@ def _draw(
     markers: Sequence[dict[str, Any]],
 ) -> None:
     """Draw the markers and both poses of each into the photograph."""
-    # It imports matplotlib.
+    from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses
 
     sticks: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
     for marker in markers:

@@ -19,8 +19,6 @@ from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared
 from jaxnav.commands.process import configure_jax
 from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput, visible
-from jaxnav.files.configuration import step_folder
-from jaxnav.files.executables import keep_in
 from jaxnav.files.ros import load_ros
 from jaxnav.vehicles.ros.connection import Connection
 
@@ -36,7 +34,6 @@ def run(args: Ros, signals: Signals) -> int:
         Interrupted: a signal came.
     """
     configure_jax(float64=args.float64, threads=1)
-    keep_in(step_folder())
     node = _Node(args, signals)
     try:
         if not args.managed:

@@ -48,7 +48,6 @@ from jaxnav.drive.signals import EXIT_STOPPED, Signals
 from jaxnav.errors import BadInput, Containment, visible
 from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
 from jaxnav.files.configuration import step_folder
-from jaxnav.files.executables import keep_in
 from jaxnav.files.vehicles import may_resume
 from jaxnav.recordings.drive_setup import DriveSetup
 
@@ -72,7 +71,6 @@ def run(args: Run, signals: Signals) -> int:
         Interrupted: a signal came before the drive began.
     """
     configure_jax(float64=args.float64, threads=1)
-    keep_in(step_folder())
     options = key_values("--option", args.option)
     setup = _setup(args, options)
     signals.check()

@@ -166,6 +166,7 @@ class DriveStudy(Study):
         if value["laps"] and scenario.drives:
             scenario = on_laps(scenario, value["laps"])
         turn_rad, shift_m = scenario.extrinsics_off
+        starts = (value["start_x_m"], value["start_y_m"], _radians(value["start_heading_deg"]))
         changed: Scenario = _replaced(
             scenario,
             odometry=_replaced(
@@ -179,6 +180,8 @@ class DriveStudy(Study):
                 _given(_radians(value["cameras_off_deg"]), turn_rad),
                 _given(value["cameras_off_m"], shift_m),
             ),
+            start_pose=tuple(map(_given, starts, scenario.start_pose)),
+            corner_drift_px=_given(value["corner_drift_px"], scenario.corner_drift_px),
             corner_lag_s=value["corner_lag_s"],
             corner_correlation=value["corner_correlation"],
             duration_s=value["duration_s"],
@@ -216,17 +219,7 @@ class DriveStudy(Study):
             integral_per_ms=value["integral_per_ms"],
             corner_sigma_px=told_px,
         )
-        starts = (value["start_x_m"], value["start_y_m"], _radians(value["start_heading_deg"]))
-        start = list(map(_given, starts, scenario.start_pose))
-        return Rollout(
-            navigator,
-            vehicle,
-            markers,
-            scenario,
-            value["corner_noise_px"],
-            jnp.asarray(_given(value["corner_drift_px"], scenario.corner_drift_px), float),
-            jnp.asarray(start, float),
-        )
+        return Rollout(navigator, vehicle, markers, scenario, value["corner_noise_px"])
 
     def _world(self, value: Mapping[str, Any]) -> tuple[CameraRig, MarkerMap]:
         rig, markers = jax.tree.map(jnp.asarray, (self.rig, self.markers))

@@ -27,6 +27,7 @@ from jaxnav.core.models.vehicle import TwistBase, advance_bicycle, advance_twist
 from jaxnav.core.navigator import Navigator, State
 from jaxnav.core.pose.observation import Observation
 from jaxnav.experiments.tuning.recorded import FrameSequences
+from jaxnav.files.executables import kept
 
 # Standard deviation of a pose that was carried back, m and rad: a third of the difference between
 # the two poses of a marker where they can be mistaken for each other.
@@ -43,7 +44,7 @@ class SequenceEstimates(eqx.Module):
     decided: Bool[Array, "*B T"]
 
 
-@eqx.filter_jit
+@kept
 def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
     """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
 
@@ -113,7 +114,7 @@ def find_starts(navigator: Navigator, recorded: FrameSequences) -> SequenceStart
     return SequenceStarts(_around(navigator, poses), chosen)
 
 
-@eqx.filter_jit
+@kept
 def _carried_back(
     navigator: Navigator, obs: Observation, T_world_vehicle: Array, frames: Array
 ) -> Float[Array, "B 7"]:
@@ -146,7 +147,7 @@ def _carried_back(
     return T_world_vehicle_from_planar(planar).wxyz_xyz
 
 
-@eqx.filter_jit
+@kept
 def _around(navigator: Navigator, T_world_vehicle: Float[Array, "B 7"]) -> Bank:
     """A bank of one hypothesis for each pose, at rest, with a wide covariance."""
     motion = navigator.motion

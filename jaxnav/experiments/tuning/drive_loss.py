@@ -72,7 +72,7 @@ class CostsOfFrame(Keep):
     It takes a soft or a hard controller.
     """
 
-    scenario: Scenario = eqx.field(static=True)
+    scenario: Scenario
 
     def __call__(self, before: DriveState, obs: Observation, after: DriveState) -> Costs:
         scenario, dtype = self.scenario, after.car.pose.dtype

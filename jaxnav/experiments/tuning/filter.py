@@ -16,6 +16,7 @@ from jaxnav.experiments.tuning.following import follow, trust_corners
 from jaxnav.experiments.tuning.objective import Batch
 from jaxnav.experiments.tuning.recorded import FrameSequences
 from jaxnav.experiments.tuning.unconstrained import Space
+from jaxnav.files.executables import kept
 
 _CM2_PER_M2 = 1e4
 
@@ -79,7 +80,7 @@ class FilterCost(eqx.Module):
         return _mean(self, x, batch)
 
 
-@eqx.filter_jit
+@kept
 def _mean(cost: FilterCost, x: Array, batch: Batch) -> Array:
     zero = jnp.zeros((), x.dtype)
     costs = jax.vmap(lambda item: cost(x, item, zero))(batch.items)

@@ -30,6 +30,7 @@ from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import MODEL_SIGMA_PX, Observation, Snapshot
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, limits
+from jaxnav.files.executables import kept
 from jaxnav.recordings.other.recording import Recording
 from jaxnav.recordings.other.smoothed import Kept, Localised, Packed, smooth_chunks
 from jaxnav.recordings.ros.body import MAX_DT_S
@@ -122,15 +123,15 @@ def replay(
     )
     total, motions = len(recording), (recording.twists, recording.preintegrated)
     first = _frames(recording, motions, 0)
-    run_chunk = _run_chunk.lower(navigator, state, first, one_at_a_time, smooth).compile()
+    run_chunk = _run_chunk.load(navigator, state, first, one_at_a_time=one_at_a_time, smooth=smooth)
     started = time.perf_counter()
     begins = range(0, total, CHUNK_FRAMES)
-    chunks, kept = [], []
+    chunks, filtered_frames = [], []
     for begin in begins:
         state, outputs, to_smooth = run_chunk(navigator, state, _frames(recording, motions, begin))
         chunks.append(jax.device_get(outputs))
         if smooth:
-            kept.append(Packed.from_kept(to_smooth))
+            filtered_frames.append(Packed.from_kept(to_smooth))
         progress(min(CHUNK_FRAMES, total - begin))
     elapsed_s = time.perf_counter() - started
 
@@ -158,7 +159,7 @@ def replay(
     def observations(index: int) -> Observation:
         return obs_of(_frames(recording, motions, begins[index]))
 
-    for index, poses in smooth_chunks(navigator, tracks, kept, observations):
+    for index, poses in smooth_chunks(navigator, tracks, filtered_frames, observations):
         truth = _frames(recording, motions, begins[index]).T_world_vehicle_true
         chunks[index] = jax.device_get(_judge_all(poses, truth))
         progress(min(CHUNK_FRAMES, total - begins[index]))
@@ -195,7 +196,7 @@ def estimate_corner_sigma_px(recording: Recording) -> float:
     return float(np.hypot(sigma_px, MODEL_SIGMA_PX))
 
 
-@jax.jit
+@kept
 @functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
 def _best_e1_px2(
     rig: CameraRig, markers: MarkerMap, corners_px: Array, camera: Array, marker: Array
@@ -226,12 +227,12 @@ def _judge(poses: Localised, T_world_vehicle_true: Array) -> _Judged:
     )
 
 
-_judge_all = jax.jit(jax.vmap(jax.vmap(_judge, (0, None))))
+_judge_all = kept(jax.vmap(jax.vmap(_judge, (0, None))))
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4))
+@kept
 def _run_chunk(
-    navigator: Navigator, state: State, chunk: _Frames, one_at_a_time: bool, smooth: bool
+    navigator: Navigator, state: State, chunk: _Frames, *, one_at_a_time: bool, smooth: bool
 ) -> tuple[State, _Judged, Kept | None]:
     """Run all tracks over the frames of a chunk; `state` has a leading axis (tracks,).
 
@@ -260,8 +261,8 @@ def _run_chunk(
         tracks = jnp.arange(len(markers.ids) if one_at_a_time else 1)
         return jax.vmap(alone if one_at_a_time else together)(state, tracks)
 
-    state, (judged, kept) = jax.lax.scan(step, state, chunk)
-    return state, judged, kept
+    state, (judged, to_smooth) = jax.lax.scan(step, state, chunk)
+    return state, judged, to_smooth
 
 
 def _with_markers(navigator: Navigator, markers: MarkerMap) -> Navigator:

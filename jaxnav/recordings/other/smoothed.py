@@ -20,6 +20,7 @@ from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.core.pose.refine import Candidates
+from jaxnav.files.executables import kept
 
 
 class Kept(eqx.Module):
@@ -44,11 +45,11 @@ class Packed(NamedTuple):
     covariance: Float[np.ndarray, "rows d d"]
 
     @staticmethod
-    def from_kept(kept: Kept) -> "Packed":
+    def from_kept(filtered: Kept) -> "Packed":
         """Pack frames."""
-        kept = jax.device_get(kept)
-        bank = kept.belief.bank
-        bare = eqx.tree_at(_moments, kept, (None, None))
+        filtered = jax.device_get(filtered)
+        bank = filtered.belief.bank
+        bare = eqx.tree_at(_moments, filtered, (None, None))
         lives, mean, covariance = map(np.asarray, (bank.initialised, bank.mean, bank.covariance))
         return Packed(bare, lives, mean[lives], covariance[lives])
 
@@ -62,8 +63,8 @@ class Packed(NamedTuple):
         return eqx.tree_at(_moments, self.bare, tuple(filled), is_leaf=lambda leaf: leaf is None)
 
 
-def _moments(kept: Kept) -> tuple[Array, Array]:
-    return kept.belief.bank.mean, kept.belief.bank.covariance
+def _moments(filtered: Kept) -> tuple[Array, Array]:
+    return filtered.belief.bank.mean, filtered.belief.bank.covariance
 
 
 # Of what lies behind a frame on the way back, for each track; and the observation of all tracks.
@@ -92,14 +93,14 @@ class Localised(eqx.Module):
 def smooth_chunks(
     navigator: Navigator,
     tracks: int,
-    kept: list[Packed],
+    filtered: list[Packed],
     observations: Callable[[int], Observation],
 ) -> Iterator[tuple[int, Localised]]:
     """Go back through the chunks of a recording: yield the index and the poses of each.
 
     Args:
         navigator: the one that filtered them.
-        kept: of each chunk; it is emptied on the way.
+        filtered: of each chunk; it is emptied on the way.
         observations: of the chunk with an index, (F,) in every leaf.
     """
     bank = navigator.motion.init(navigator.selector.hypotheses)
@@ -108,43 +109,45 @@ def smooth_chunks(
         (Trail.begin(bank, jnp.asarray(False)), bank.parent),
     )
     behind: _Behind | None = None
-    for index in reversed(range(len(kept))):
+    for index in reversed(range(len(filtered))):
         obs = observations(index)
         behind = behind or (*end, jax.tree.map(lambda leaf: leaf[0], obs))  # any
-        behind, poses = smooth_frames(navigator, behind, kept.pop().unpack(), obs)
+        behind, poses = smooth_frames(navigator, behind, filtered.pop().unpack(), obs)
         yield index, poses
 
 
-@jax.jit
+@kept
 def smooth_frames(
-    navigator: Navigator, behind: _Behind, kept: Kept, obs: Observation
+    navigator: Navigator, behind: _Behind, filtered: Kept, obs: Observation
 ) -> tuple[_Behind, Localised]:
     """Go back through frames, from the last to the first.
 
     Args:
         navigator: the one that filtered them.
         behind: of the last frame.
-        kept: (F, tracks) frames.
+        filtered: (F, tracks) frames.
         obs: F observations, of which `dt_s` and the odometry are used.
     """
 
-    def one(trail: Trail, parent: Array, kept: Kept, later: Observation) -> tuple[Trail, Localised]:
-        belief = kept.belief
+    def one(
+        trail: Trail, parent: Array, filtered: Kept, later: Observation
+    ) -> tuple[Trail, Localised]:
+        belief = filtered.belief
         trail = trail.back(navigator.motion, belief.bank, belief.decided, parent, later)
-        return trail, _report(navigator, trail, kept)
+        return trail, _report(navigator, trail, filtered)
 
     def back(behind: _Behind, frame: tuple[Kept, Observation]) -> tuple[_Behind, Localised]:
-        (trail, parent, later), (kept, obs) = behind, frame
-        trail, smoothed = jax.vmap(one, (0, 0, 0, None))(trail, parent, kept, later)
-        return (trail, kept.belief.bank.parent, obs), smoothed
+        (trail, parent, later), (filtered, obs) = behind, frame
+        trail, smoothed = jax.vmap(one, (0, 0, 0, None))(trail, parent, filtered, later)
+        return (trail, filtered.belief.bank.parent, obs), smoothed
 
-    smoothed: tuple[_Behind, Localised] = jax.lax.scan(back, behind, (kept, obs), reverse=True)
+    smoothed: tuple[_Behind, Localised] = jax.lax.scan(back, behind, (filtered, obs), reverse=True)
     return smoothed
 
 
-def _report(navigator: Navigator, trail: Trail, kept: Kept) -> Localised:
+def _report(navigator: Navigator, trail: Trail, filtered: Kept) -> Localised:
     """What is reported of one frame of one track."""
-    motion, belief, selector = navigator.motion, kept.belief, navigator.selector
+    motion, belief, selector = navigator.motion, filtered.belief, navigator.selector
     bank: Bank = trail.as_bank(belief.bank)
     best = heaviest(bank)
     T = motion.T_world_vehicle(bank.mean[best])
@@ -152,7 +155,7 @@ def _report(navigator: Navigator, trail: Trail, kept: Kept) -> Localised:
     if isinstance(selector, MultiHypothesis):
         flip_probability = doubt(motion, bank, selector.far_rad)
         decided = bank.initialised[best] & (flip_probability < selector.decided_mass)
-    candidates = kept.candidates
+    candidates = filtered.candidates
     off_rad = jax.vmap(lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T))(
         candidates.T_vehicle_world
     )
