@@ -21,7 +21,7 @@ from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import OFF_GROUND, T_world_vehicle_from_planar
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation, Snapshot, log_sigmas
-from jaxnav.experiments.tuning.following import trust_corners
+from jaxnav.experiments.tuning.filter import trust_corners
 from tests import worlds
 from tests.reference import kalman as textbook
 

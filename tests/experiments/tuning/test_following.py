@@ -23,8 +23,7 @@ from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.experiments.tuning import branches
 from jaxnav.experiments.tuning import filter as tuned_filter
 from jaxnav.experiments.tuning.branches import SequenceStarts, find_starts
-from jaxnav.experiments.tuning.filter import FilterCost
-from jaxnav.experiments.tuning.following import FilterScores, follow, trust_corners
+from jaxnav.experiments.tuning.filter import FilterCost, FilterScores, follow, trust_corners
 from jaxnav.experiments.tuning.recorded import FrameSequences, simulate_sequences
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.sim.rollout import Rollout
