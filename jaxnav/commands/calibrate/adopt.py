@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from jaxnav.commands.calibrate.arguments import CalibrateAdopt
-from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
+from jaxnav.commands.report import provenance, publish
 from jaxnav.core.models.vehicle import SENSOR_ERRORS
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder

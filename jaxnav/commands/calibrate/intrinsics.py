@@ -13,8 +13,8 @@ from jaxnav.calibrate.lens.intrinsics import LensCalibration, calibrate_images
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board
-from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import provenance, publish
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig, output_folder

@@ -1,4 +1,4 @@
-"""Arguments of the commands that drive a car, or read a recording or a photograph."""
+"""Arguments of the commands that drive a car or check it, or read a recording or a photograph."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ from jaxnav.commands.kinds import (
     Selector,
     SizeM,
     Switch,
+    key_values,
     optional,
     require,
 )
@@ -250,6 +251,22 @@ class ViewDrive:
 
 
 @dataclass(frozen=True)
+class Plot:
+    """Draw a study or a recorded drive.
+
+    Of a study: flip-rate maps, curves with their intervals, reliability diagrams, and summary.json
+    with the measures of every cell; if it is not finished, as far as it is. Of a drive (.mcap):
+    drive.png, a map with what happened over time, and a summary in the terminal.
+    """
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STORE")]
+    """What `jaxnav study` wrote, or a recorded drive (.mcap)."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
+    """Folder for the pictures."""
+    headless: Headless = False
+
+
+@dataclass(frozen=True)
 class Locate:
     """Find markers in a photograph and print both poses of each.
 
@@ -273,3 +290,37 @@ class Locate:
     """Print JSON instead of a table."""
     out: Annotated[Path | None, optional("FILE")] = None
     """Draw the markers and both poses into this file, .png or .jpg, as large as the photograph."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check what a car will run with, and say what to do about each finding.
+
+    Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that
+    the car's cameras took while it stood, and the plug-ins, which are opened and read but not
+    driven. Exit code 0: no error; 1: an error was found; 2: a file or a flag is not understood.
+    """
+
+    rig: QCarRig = None
+    markers: QCarMarkers = None
+    vehicle: QCarVehicle = None
+    route: QCarFile = None
+    """Start and waypoints."""
+    car: OptionalName = None
+    """Vehicle plug-in to open and read: an installed name or module:name."""
+    cameras: OptionalName = None
+    """Camera plug-in to open and read: an installed name or module:name."""
+    option: KeyValues = ()
+    """What the plug-ins are told."""
+    frame: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], optional("CAMERA=IMAGE", "(repeatable)")
+    ] = ()
+    """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
+    drive: Annotated[Path | None, optional("FILE.mcap")] = None
+    """A recorded drive with eights, or stops and starts: are the cameras later than they say?"""
+    json: OptionalFile = None
+    """Write all findings into this file too."""
+
+    def __post_init__(self) -> None:
+        key_values("--option", self.option)
+        key_values("--frame", self.frame, "CAMERA=IMAGE")

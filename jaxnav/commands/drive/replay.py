@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from jaxnav.commands.drive import replay_drive
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.report import corners_in_world, save_figure
+from jaxnav.commands.report import corners_in_world, write_report
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible
@@ -23,12 +23,14 @@ from jaxnav.files import (
     load_rig,
     load_topics,
     output_folder,
-    write_json,
     write_tum,
 )
 from jaxnav.recordings.other.odometry_delay import odometry_delay
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 _SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history
@@ -69,16 +71,15 @@ def run(args: Arguments) -> int:
         )
     summary = _summary(args, recording, result)
     _write_tracks(args, recording, result)
-    _draw(recording, result, _text(summary), out / "report.png")
-    write_json(out / "summary.json", summary)
-    print(_text(summary))
+    lines = [_text(summary)]
     if recording.odometry is not None:
         track = int(np.argmax(result.seen.sum(axis=0)))  # the one that sees most
         poses, seen = result.T_world_vehicle[:, track], result.seen[:, track]
         delay = odometry_delay(recording.odometry, recording.stamps_ns, poses, seen)
         if delay is not None:
-            print(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
-    print(f"report in {visible(out)}")
+            lines.append(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
+    lines.append(f"report in {visible(out)}")
+    write_report(out, summary, lines, report=_picture(recording, result, _text(summary)))
     return 0
 
 
@@ -119,7 +120,6 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
     position_m, rotation_deg = errors(result, recording)
     judged = result.seen & recording.reference.valid[:, None]
     settled = judged & (frames_in_view(result.seen) > _SETTLED_FRAMES)
-
     wrong, outlier = np.asarray(result.branch.wrong), np.asarray(result.branch.outlier)
 
     def fraction(of: np.ndarray, among: np.ndarray) -> float:
@@ -158,7 +158,7 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
         )
 
 
-def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
+def _picture(recording: Recording, result: Replay, title: str) -> "Figure":
     # It imports matplotlib, which a drive that is compared needs not.
     from jaxnav.pictures.localisation import localisation_report
 
@@ -173,7 +173,7 @@ def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
         names = "position error (m)", "rotation error (deg)"
         off = errors(result, recording)
         drawn = {name: values.T.ravel() for name, values in zip(names, off, strict=True)}
-    picture = localisation_report(
+    return localisation_report(
         np.tile(times_s, tracks),
         positions_m.transpose(1, 0, 2).reshape(-1, 3),
         reference_m,
@@ -182,7 +182,6 @@ def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
         title=title,
         connected=tracks == 1,
     )
-    save_figure(picture, path)
 
 
 def _text(summary: dict[str, Any]) -> str:

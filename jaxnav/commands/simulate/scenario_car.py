@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from jaxnav.commands.kinds import ScenarioCarFiles
+from jaxnav.commands.simulate.arguments import ScenarioCarFiles
 from jaxnav.core.filter.choose import Selector
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar

@@ -9,7 +9,7 @@ import jax
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.study.arguments import RunStudy as Arguments
+from jaxnav.commands.simulate.arguments import RunStudy as Arguments
 from jaxnav.commands.study.studies import KINDS, load_study, shipped_configs
 from jaxnav.errors import EXIT_INTERRUPTED, visible
 from jaxnav.experiments.studies.running import (

@@ -9,11 +9,11 @@ import jaxlie
 import numpy as np
 import pytest
 import yaml
-
-from jaxnav.commands.doctor import rig_file, route_file
 from jaxnav.commands.doctor.markers_file import measured_corners, placed
 from jaxnav.commands.doctor.rig_file import bearings, lenses, places
 from jaxnav.commands.doctor.route_file import sight_along, turning_radius_m, vehicle_file
+
+from jaxnav.commands.doctor import rig_file, route_file
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.lenses import MOST_COEFFICIENTS
 from jaxnav.core.models.rig import CameraRig

@@ -7,9 +7,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from jaxnav.commands.doctor.cameras import Watched, judge_cameras, skew
 
 from jaxnav.commands.doctor import cameras, plug_ins
-from jaxnav.commands.doctor.cameras import Watched, judge_cameras, skew
 from jaxnav.commands.doctor.findings import EXIT_UNREADABLE, Report
 from jaxnav.commands.doctor.plug_ins import Reading, judge_odometry
 from jaxnav.core.models.vehicle import TwistBase

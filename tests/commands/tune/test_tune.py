@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.commands.tune.arguments import TuneController, TuneFilter
+from jaxnav.commands.simulate.arguments import TuneController, TuneFilter
 from jaxnav.commands.tune.controller import closed_loop, gains_of
 from jaxnav.commands.tune.filter import space_of
 from jaxnav.core.filter.choose import LowestReprojection
