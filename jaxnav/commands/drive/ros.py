@@ -13,9 +13,8 @@ from functools import partial
 from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros
-from jaxnav.commands.drive.ros_body import PreparedBody
 from jaxnav.commands.drive.ros_drive import OVER, PreparedDrive
-from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared
+from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared, PreparedBody
 from jaxnav.commands.process import configure_jax
 from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput, visible
