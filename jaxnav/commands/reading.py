@@ -8,7 +8,7 @@ from typing import Any
 from jaxnav.commands.bars import FROM_S, progress_bar
 from jaxnav.commands.kinds import flag_of
 from jaxnav.errors import BadInput
-from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
+from jaxnav.files import calib_dir, load_markers, load_rig, load_route, load_vehicle
 from jaxnav.recordings.drive_log import DriveLog, read_drive
 
 _LOADS = {
@@ -16,20 +16,23 @@ _LOADS = {
 }  # fmt: skip
 
 
-def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dict[str, Any]:
-    """The content of the files that are given in place of a recording's own.
+def given_files(
+    args: Any, names: Sequence[str], bag: Path | None = None, or_qcars: bool = False
+) -> dict[str, Any]:
+    """The content of the files that are given, by their names.
 
     Args:
         args: with the fields rig, markers, vehicle and route, as far as they are asked for.
         names: those asked for: rig, markers, vehicle, route.
         bag: a recording that holds none of them, so that all must be given.
+        or_qcars: whether the QCar's file stands for one that is not given.
 
     Raises:
         BadInput: a file that is not valid, or the flag of one that is missing.
     """
     content = {}
     for name in names:
-        path = getattr(args, name)
+        path = getattr(args, name) or (calib_dir() / "qcar" / f"{name}.yaml" if or_qcars else None)
         if path is not None:
             content[name] = _LOADS[name](path)
         elif bag is not None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from jaxnav.commands.reading import given_files
 from jaxnav.commands.simulate.arguments import ScenarioCarFiles
 from jaxnav.core.filter.choose import Selector
 from jaxnav.core.filter.planar import BicycleKalman
@@ -14,16 +15,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
-from jaxnav.files import (
-    Params,
-    Route,
-    apply_params,
-    calib_dir,
-    load_markers,
-    load_rig,
-    load_route,
-    load_vehicle,
-)
+from jaxnav.files import Params, Route, apply_params, load_route
 from jaxnav.sim.bases import equipped
 from jaxnav.sim.corners import see
 from jaxnav.sim.scenarios import Scenario, on_route, scenarios
@@ -50,17 +42,12 @@ class ScenarioCar:
         Raises:
             BadInput: a file that is not valid.
         """
-        qcar = calib_dir() / "qcar"
-        vehicle = load_vehicle(files.vehicle or qcar / "vehicle.yaml")
-        markers = load_markers(files.markers or qcar / "markers.yaml")
-        route = None if files.route is None else load_route(files.route)
-        return ScenarioCar(
-            rig=load_rig(files.rig or qcar / "rig.yaml"),
-            markers=markers,
-            vehicle=equipped(vehicle, files.base, files.imu),
-            params=params,
-            route=None if route is None else route.relative_to(markers.origin_m),
-        )
+        content = given_files(files, ("rig", "markers", "vehicle"), or_qcars=True)
+        vehicle = equipped(content.pop("vehicle"), files.base, files.imu)
+        route = None
+        if files.route is not None:
+            route = load_route(files.route).relative_to(content["markers"].origin_m)
+        return ScenarioCar(**content, vehicle=vehicle, params=params, route=route)
 
     def scenario(self, name: str) -> Scenario:
         """A scenario by its name, on this car's route if it has one.

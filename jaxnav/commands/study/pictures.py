@@ -9,7 +9,7 @@ import xarray as xr
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Plot as Arguments
 from jaxnav.commands.report import save_figure
-from jaxnav.commands.study.studies import summary_of
+from jaxnav.commands.study.study import summary_of
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.pictures.study import numeric_axes, study_curves, study_map, study_reliability
