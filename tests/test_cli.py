@@ -39,23 +39,14 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], list]:
 
 def test_arguments_reach_the_command(command) -> None:
     received = command(lambda: 0)
-    assert (
-        cli.main(
-            "demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x --params p.yaml".split()
-        )
-        == 0
-    )
-    assert cli.main("replay --limit 5 --one-at-a-time --markers m.yaml bag".split()) == 0
-    assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --as-json".split()) == 0
+    for typed in (
+        "demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x",
+        "replay --limit 5 --one-at-a-time --markers m.yaml bag",
+        "locate a.png --camera c.yaml --marker-size-m 0.1 --as-json",
+    ):
+        assert cli.main(typed.split()) == 0
     assert received == [
-        Demo(
-            seed=3,
-            blur=False,
-            exposure_ms=2.0,
-            rig=Path("a.yaml"),
-            out=Path("x"),
-            params=Path("p.yaml"),
-        ),
+        Demo(seed=3, blur=False, exposure_ms=2.0, rig=Path("a.yaml"), out=Path("x")),
         ReplayRecording(Path("bag"), limit=5, one_at_a_time=True, markers=Path("m.yaml")),
         Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, as_json=True),
     ]
@@ -89,6 +80,8 @@ def test_the_exit_code_is_the_commands(command) -> None:
             "locate a.png --camera c --marker-size-m -0.1",
             "jaxnav locate: --marker-size-m: must be from 0.001 to 100 m, got -0.1",
         ),
+        ("tune filter --seeds 0", "jaxnav tune: --seeds: must be at least 1, got 0"),
+        ("calibrate rig", "jaxnav calibrate: RECORDING: missing: what has the rig seen?"),
     ],
 )
 def test_wrong_usage_gets_one_line(arguments, line, command, capsys) -> None:
@@ -122,44 +115,28 @@ def test_the_line_is_the_same_under_every_encoding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "line"),
+    ("raised", "code", "line"),
     [
-        (["simulate", "--seeds", "0"], "jaxnav simulate: --seeds: must be at least 1, got 0\n"),
-        (["tune", "filter", "--seeds", "0"], "jaxnav tune: --seeds: must be at least 1, got 0\n"),
-        (["calibrate", "rig"], "jaxnav calibrate: RECORDING: missing: what has the rig seen?\n"),
+        (
+            BadInput("rig.yaml: cameras[1].lens", "unknown lens 'fish'\nexpected one of ..."),
+            cli.EXIT_BAD_INPUT,
+            "jaxnav demo: rig.yaml: cameras[1].lens: unknown lens 'fish' expected one of ...\n",
+        ),
+        (KeyboardInterrupt(), cli.EXIT_INTERRUPTED, "jaxnav demo: interrupted\n"),
+        (ZeroDivisionError(), None, ""),  # a defect keeps its traceback
     ],
 )
-def test_a_bad_flag_is_named_as_it_was_typed(words, line, capsys) -> None:
-    assert cli.main(words) == cli.EXIT_BAD_INPUT
+def test_what_a_command_raises_gets_one_line(command, capsys, raised, code, line) -> None:
+    def run() -> int:
+        raise raised
+
+    command(run)
+    if code is None:
+        with pytest.raises(type(raised)):
+            cli.main(["demo"])
+    else:
+        assert cli.main(["demo"]) == code
     assert capsys.readouterr() == ("", line)
-
-
-def test_bad_input_gets_one_line(command, capsys) -> None:
-    def run() -> int:
-        raise BadInput("rig.yaml: cameras[1].lens", "unknown lens 'fish'\nexpected one of ...")
-
-    command(run)
-    assert cli.main(["demo"]) == cli.EXIT_BAD_INPUT
-    line = "jaxnav demo: rig.yaml: cameras[1].lens: unknown lens 'fish' expected one of ...\n"
-    assert capsys.readouterr() == ("", line)
-
-
-def test_an_interruption_gets_one_line(command, capsys) -> None:
-    def run() -> int:
-        raise KeyboardInterrupt
-
-    command(run)
-    assert cli.main(["replay", "bag"]) == cli.EXIT_INTERRUPTED
-    assert capsys.readouterr() == ("", "jaxnav replay: interrupted\n")
-
-
-def test_a_defect_keeps_its_traceback(command) -> None:
-    def run() -> int:
-        raise ZeroDivisionError
-
-    command(run)
-    with pytest.raises(ZeroDivisionError):
-        cli.main(["demo"])
 
 
 POSITIONALS = tuple(
@@ -184,12 +161,9 @@ def test_help_explains_every_flag(name, capsys) -> None:
     assert err == ""
     assert "{None}" not in out
     for field in dataclasses.fields(command):
-        is_positional = field.name in POSITIONALS
-        flag = (
-            POSITIONAL.get(field.name, field.name.upper())
-            if is_positional
-            else "--" + field.name.replace("_", "-")
-        )
+        flag = "--" + field.name.replace("_", "-")
+        if field.name in POSITIONALS:
+            flag = POSITIONAL.get(field.name, field.name.upper())
         assert re.search(rf"(?m)^.? ?{flag}(?!\w)", out), flag
     # A flag without a docstring would be followed by its default alone.
     unframed = " ".join(out.replace("│", " ").split())

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnav.commands.doctor import cameras
+from jaxnav.commands.doctor import plug_ins
 from jaxnav.commands.drive import delay_watch
 from jaxnav.commands.drive.delay_watch import DelayWatch, delays_of, warnings
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
@@ -266,13 +266,13 @@ def test_of_cameras_in_time_nothing_is_said(capsys):
 
 def test_the_doctor_tells_it_of_a_recorded_drive(monkeypatch):
     path = Path("drive.mcap")
-    monkeypatch.setattr(cameras, "read_drive", lambda _: Drive(0.05).log(SETUP))
-    late = list(cameras.stamps(path))
+    monkeypatch.setattr(plug_ins, "read_drive", lambda _: Drive(0.05).log(SETUP))
+    late = list(plug_ins.stamps(path))
     assert late[0].level == "warning"
     assert "later than stamps say" in late[0].what
     assert "camera_delay_s" in late[0].do
-    monkeypatch.setattr(cameras, "read_drive", lambda _: Drive().log(SETUP))
-    fine = list(cameras.stamps(path))
+    monkeypatch.setattr(plug_ins, "read_drive", lambda _: Drive().log(SETUP))
+    fine = list(plug_ins.stamps(path))
     assert {finding.level for finding in fine} <= {"ok", "note"}
     assert fine[0].level == "ok"
     assert any("does not tell" in finding.what for finding in fine)  # who saw no marker

@@ -199,9 +199,6 @@ def _in_words(read: Read) -> str:
 def _wrong_stamps(
     readings: Sequence[Reading], ages_s: Sequence[float], rate_hz: float
 ) -> Iterator[Finding]:
-    """Args:
-    rate_hz: of distinct stamps.
-    """
     slow, count = sum(reading.took_s > SLOW_S for reading in readings), len(readings)
     if min(ages_s) < 0:
         yield found("odometry.future", age_s=-min(ages_s))

@@ -113,9 +113,6 @@ class LiveView(DriveObserver):
     """An observer that shows outcomes in Rerun's window; a closed window is no fault."""
 
     def __init__(self, view: "RerunView"):
-        """Args:
-        view: a live view.
-        """
         self._view = view
 
     def on_outcome(self, given: Input, outcome: Outcome) -> None:
@@ -182,20 +179,15 @@ class ExposureWatch(DriveObserver):
     """Tells in the end how long cameras expose, by the streaks of markers."""
 
     def __init__(self, names: Sequence[str], searches: Sequence[Search]):
-        """Args:
-        names: of the cameras.
-        searches: one for each.
-        """
         self._names, self._searches = tuple(names), tuple(searches)
 
     @property
     def closing_note(self) -> str | None:
-        trackers = [search.tracker for search in self._searches]
-        exposures_s = [None if one is None else one.learnt_exposure_s for one in trackers]
         lines = [
             f"learnt: camera {visible(name)} exposes for {1e3 * exposure_s:.1f} ms, by the streaks "
             f"of markers: `exposure_s: {exposure_s:.2g}` in rig.yaml tells it from the start"
-            for name, exposure_s in zip(self._names, exposures_s, strict=True)
-            if exposure_s is not None
+            for name, search in zip(self._names, self._searches, strict=True)
+            if search.tracker is not None
+            and (exposure_s := search.tracker.learnt_exposure_s) is not None
         ]
         return "\n".join(lines) or None

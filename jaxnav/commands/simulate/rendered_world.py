@@ -37,7 +37,7 @@ class RenderedWorld:
     """The objects of a demo, built from its files, with a renderer."""
 
     setup: DriveSetup  # without the parameters
-    vehicle: Vehicle  # its own
+    vehicle: Vehicle
     params: Params | None
     renderer: Renderer
     cameras: list[Camera]  # those of the rig, one by one

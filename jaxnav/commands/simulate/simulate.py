@@ -34,31 +34,27 @@ _OLDER = {"params": None, "laps": 0, "base": "ackermann", "imu": "none", "route"
 def run(args: Arguments) -> int:
     """Drive every combination of selector and noise; print a table, and keep the numbers."""
     with nullcontext() if args.json is None else sole_writer(args.json):
-        return _run(args)
-
-
-def _run(args: Arguments) -> int:
-    configure_jax(float64=False)
-    collect_garbage_rarely()
-    names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
-    wanted = list(itertools.product(names, args.corner_noise_px))
-    done = _resumed(args)
-    params = None if args.params is None else load_params(args.params)
-    car = ScenarioCar.load(args, params)
-    scenario = _scenario(args, car)
-    if car.params is not None:
-        print(car.params.describe())
-    print(_header(scenario))
-    for name, noise_px in wanted:
-        key = _key(args, car, name, noise_px)
-        matches = [one for one in done if _OLDER | one["run"] == key]
-        result = matches[0] if matches else {"run": key} | _drive(args, car, scenario, key)
-        if not matches:
-            done.append(result)
-        if args.json is not None:
-            several = len(wanted) > 1 or len(done) > 1
-            write_json(args.json, {"runs": done} if several else result)
-        print(_row(result, scenario), flush=True)
+        configure_jax(float64=False)
+        collect_garbage_rarely()
+        names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
+        wanted = list(itertools.product(names, args.corner_noise_px))
+        done = _resumed(args)
+        params = None if args.params is None else load_params(args.params)
+        car = ScenarioCar.load(args, params)
+        scenario = _scenario(args, car)
+        if car.params is not None:
+            print(car.params.describe())
+        print(_header(scenario))
+        for name, noise_px in wanted:
+            key = _key(args, car, name, noise_px)
+            matches = [one for one in done if _OLDER | one["run"] == key]
+            result = matches[0] if matches else {"run": key} | _drive(args, car, scenario, key)
+            if not matches:
+                done.append(result)
+            if args.json is not None:
+                several = len(wanted) > 1 or len(done) > 1
+                write_json(args.json, {"runs": done} if several else result)
+            print(_row(result, scenario), flush=True)
     return 0
 
 
@@ -90,13 +86,8 @@ def _drive(
     name, noise_px = key["selector"], key["corner_noise_px"]
     navigator = _navigator(car, scenario, name, key["told_noise_px"])
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
-    with progress_bar(
-        total=args.seeds,
-        unit="drive",
-        desc=f"{name}, {noise_px} px",
-        disable=args.headless,
-        leave=False,
-    ) as bar:
+    bars = {"unit": "drive", "desc": f"{name}, {noise_px} px", "disable": args.headless}
+    with progress_bar(total=args.seeds, leave=False, **bars) as bar:
         keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
         trace = rollout.run(keys, update_after_compiling(bar))
     return Drives.of(trace, scenario).summary()

@@ -11,7 +11,7 @@ import yaml
 from jaxnav.calibrate.odometry.drive import Drive
 from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.cli import main
-from jaxnav.commands.calibrate.odometry_recordings import drive_of
+from jaxnav.commands.calibrate.odometry import drive_of
 from jaxnav.detection import Detections
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Odometry

@@ -11,9 +11,8 @@ import yaml
 
 from jaxnav import cli
 from jaxnav.calibrate.rig.views import Ts_vehicle_camera, turn_rad
-from jaxnav.commands.calibrate import check as calibrate_check
 from jaxnav.commands.calibrate import rig as calibrate_rig
-from jaxnav.commands.calibrate.rig_results import coverage
+from jaxnav.commands.calibrate.rig_data import coverage
 from jaxnav.detection.types import Detections
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Odometry
@@ -31,8 +30,7 @@ FRAMES, PERIOD_NS = 120, 50_000_000
 
 @pytest.fixture(autouse=True)
 def _as_it_is(monkeypatch) -> None:
-    for command in (calibrate_rig, calibrate_check):
-        monkeypatch.setattr(command, "configure_jax", lambda float64: None)
+    monkeypatch.setattr(calibrate_rig, "configure_jax", lambda float64: None)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.commands.kinds import Scenario, Selector, SimulatedSelector
+from jaxnav.commands.kinds import Selector, SimulatedSelector
+from jaxnav.commands.simulate.arguments import Scenario
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.commands.simulate.simulate import _navigator
