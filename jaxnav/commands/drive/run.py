@@ -128,10 +128,7 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
 
 
 def open_observers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[DriveObserver]:
-    """Open the observers that the arguments ask for.
-
-    Args:
-        closing: closes them in the end.
+    """Open the observers that the arguments ask for, which `closing` closes in the end.
 
     Raises:
         BadInput: the file can't be written, Rerun is missing or its window does not open.
@@ -179,21 +176,14 @@ def searches_for(
     """
     detectors = make_detectors(markers, corner_backend)
     rig = jax.device_get(rig)  # NumPy indexes its cameras without compiling anything
+    trackers = [Tracker(*rig.timing(c)) if follow else None for c in range(len(rig))]
     return [
-        Search(
-            c,
-            rig.image_sizes_px[c],
-            rig.camera(c),
-            detectors,
-            Tracker(*rig.timing(c)) if follow else None,
-        )
-        for c in range(len(rig))
+        Search(c, rig.image_sizes_px[c], rig.camera(c), detectors, tracker)
+        for c, tracker in enumerate(trackers)
     ]
 
 
-def compiled_pilot(
-    args: Run, setup: DriveSetup, others: Sequence[Callable[[], None]] = ()
-) -> Pilot:
+def compiled_pilot(args: Run, setup: DriveSetup, others: Sequence[Callable[[], None]]) -> Pilot:
     """A pilot that is compiled and warmed up.
 
     Args:
