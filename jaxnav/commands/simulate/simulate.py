@@ -86,8 +86,10 @@ def _drive(
     name, noise_px = key["selector"], key["corner_noise_px"]
     navigator = _navigator(car, scenario, name, key["told_noise_px"])
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
-    bars = {"unit": "drive", "desc": f"{name}, {noise_px} px", "disable": args.headless}
-    with progress_bar(total=args.seeds, leave=False, **bars) as bar:
+    with progress_bar(
+        total=args.seeds, unit="drive", desc=f"{name}, {noise_px} px", disable=args.headless,
+        leave=False,
+    ) as bar:  # fmt: skip
         keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
         trace = rollout.run(keys, update_after_compiling(bar))
     return Drives.of(trace, scenario).summary()
