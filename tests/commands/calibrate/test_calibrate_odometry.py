@@ -25,12 +25,6 @@ from tests.helpers.odometry_drives import RECIPE, START, TRUTH, sensed, true_tra
 from tests.helpers.simulated import make_setup
 
 
-@pytest.fixture(autouse=True)
-def keep_the_settings_of_jax(monkeypatch):
-    """Commands choose a precision and a cache of their own; tests keep theirs."""
-    monkeypatch.setattr("jaxnav.commands.calibrate.odometry.configure_jax", lambda float64: None)
-
-
 def sensed_drive(seed: int = 0) -> Drive:
     track = true_track(RECIPE, 30.0, start=START)
     return sensed(track, worlds.qcar_rig(), worlds.paper_markers(), seed)

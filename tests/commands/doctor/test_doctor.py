@@ -19,8 +19,7 @@ CHECKS = "jaxnav.commands.doctor"
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """The settings of the process stay, and the clock is looked at elsewhere."""
-    monkeypatch.setattr("jaxnav.commands.process.configure_jax", lambda **kwargs: None)
+    """The clock and the disk are looked at elsewhere."""
     monkeypatch.setattr(f"{CHECKS}.computer.clock", lambda: [Finding("clock", "ok", "ticks")])
     monkeypatch.setattr(f"{CHECKS}.computer.disk", lambda folder: [Finding("disk", "ok", "turns")])
 

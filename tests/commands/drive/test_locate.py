@@ -20,12 +20,6 @@ QCAR = calib_dir() / "qcar"
 POSE = np.array([np.cos(1.0), 0, 0, np.sin(1.0), 0.9, -0.3, 0.0])  # heading 115 degrees
 
 
-@pytest.fixture(autouse=True)
-def keep_the_compile_cache(monkeypatch):
-    """Commands choose a cache of their own; tests keep theirs."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
-
-
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     """The paper's marker in the QCar's front camera: a file, and T_camera_marker."""

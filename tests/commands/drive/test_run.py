@@ -473,7 +473,6 @@ def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys
     save_vehicle("base.yaml", TwistBase.create(1.0, 3.0, 0.1))
     text = Path("base.yaml").read_text()
     Path("base.yaml").write_text(text.replace("differential", "omni"))
-    monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda **_: None)
     monkeypatch.setattr(DriveSetup, "pilot", lambda *_: pytest.fail("compiles"))
     vehicle = [] if "--car" in arguments else ["--car", recorded_vehicle.NAME]
     log = tmp_path / "told"

@@ -15,14 +15,6 @@ from jaxnav.experiments.tuning.drive_loss import DriveLoss
 from jaxnav.files import load_params
 
 
-@pytest.fixture(autouse=True)
-def keep_the_settings_of_jax(monkeypatch):
-    """Commands choose a precision and a cache of their own; tests keep theirs."""
-    for command in ("filter", "controller"):
-        name = f"jaxnav.commands.tune.{command}.configure_jax"
-        monkeypatch.setattr(name, lambda float64: None)
-
-
 def told(capsys, *arguments: str) -> str:
     """The one line that bad input gets."""
     assert main(["tune", *arguments, "--headless"]) == 2
