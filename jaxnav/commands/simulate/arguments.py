@@ -7,28 +7,8 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from jaxnav.commands.kinds import (
-    Believed,
-    CornerSigma,
-    Count,
-    Detector,
-    Following,
-    Headless,
-    NotNegative,
-    OptionalFile,
-    Positive,
-    QCarFile,
-    QCarMarkers,
-    QCarRig,
-    QCarVehicle,
-    ResultsFolder,
-    Seed,
-    Selector,
-    SimulatedSelector,
-    Switch,
-    optional,
-    require,
-)
+from jaxnav.commands import kinds
+from jaxnav.commands.kinds import optional, require
 
 Scenario = Literal[
     "paper",
@@ -63,34 +43,34 @@ class Demo:
     saw, summary.json, and trajectories in TUM format.
     """
 
-    seed: Seed = 0
+    seed: kinds.Seed = 0
     """Seed of every random number: first belief, image noise, odometry noise."""
-    seeds: Count = 1
+    seeds: kinds.Count = 1
     """Drive this many times, with seeds counting up from --seed, and print the success rates."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("demo")
     """Folder for the report."""
-    selector: Selector = "multi-hypothesis"
+    selector: kinds.Selector = "multi-hypothesis"
     """Which of the two poses of a marker our method believes."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarVehicle = None
-    route: QCarFile = None
+    rig: kinds.QCarRig = None
+    markers: kinds.QCarMarkers = None
+    vehicle: kinds.QCarVehicle = None
+    route: kinds.QCarFile = None
     """Start and waypoints; by default demo_route.yaml. The paper's start is in route.yaml."""
-    params: OptionalFile = None
+    params: kinds.OptionalFile = None
     """Tuned parameters, for both methods: the noise of their filter is the same."""
     blur: bool = True
     """Integrate each image over its exposure while the car moves."""
-    exposure_ms: NotNegative = 10.0
+    exposure_ms: kinds.NotNegative = 10.0
     """Exposure time, ms."""
-    corner_noise_px: NotNegative = 0.0
+    corner_noise_px: kinds.NotNegative = 0.0
     """Spoil the corners of both methods by this much (standard deviation, px)."""
     rolling_shutter: bool = True
     """Expose the rows of an image one after the other."""
-    corner_backend: Detector = "aruco"
-    detector: Following = "follow"
-    duration_s: Positive = 30.0
+    corner_backend: kinds.Detector = "aruco"
+    detector: kinds.Following = "follow"
+    duration_s: kinds.Positive = 30.0
     """Give up when the car has not arrived after this simulated time, s."""
-    headless: Headless = False
+    headless: kinds.Headless = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,12 +82,12 @@ class ScenarioCarFiles:
     imu: Literal["none", "consumer", "tactical"] = "none"
     """The vehicle's gyro: as its file says, or one of that class, with errors drawn anew for each
     drive."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarVehicle = None
+    rig: kinds.QCarRig = None
+    markers: kinds.QCarMarkers = None
+    vehicle: kinds.QCarVehicle = None
     route: Annotated[Path | None, optional("FILE", "(default: the scenario's own)")] = None
     """Start and waypoints that go with another marker map."""
-    headless: Headless = False
+    headless: kinds.Headless = False
 
     def __post_init__(self) -> None:
         named = self.base == "ackermann" or self.vehicle is None
@@ -131,21 +111,23 @@ class Simulate(ScenarioCarFiles):
     laps: Annotated[int, Interval(ge=0, le=100)] = 0
     """Drive this many laps before the marker, 6 m and 18 s each, instead of the scenario's
     own route, for errors that repeat: `paper` is then the clean drive to compare with."""
-    selector: tuple[SimulatedSelector, ...] = ("multi-hypothesis",)
+    selector: tuple[kinds.SimulatedSelector, ...] = ("multi-hypothesis",)
     """Which pose is believed; several names, or `all`."""
-    corner_noise_px: tuple[CornerSigma, ...] = (1.0,)
+    corner_noise_px: tuple[kinds.CornerSigma, ...] = (1.0,)
     """Standard deviation of the corners, one or several."""
-    told_noise_px: Annotated[CornerSigma | None, optional("PX", "(default: the truth)")] = None
+    told_noise_px: Annotated[kinds.CornerSigma | None, optional("PX", "(default: the truth)")] = (
+        None
+    )
     """What the navigator is told of it."""
-    seeds: Count = 100
+    seeds: kinds.Count = 100
     """How many drives."""
-    seed: Seed = 0
+    seed: kinds.Seed = 0
     """The first seed."""
-    params: OptionalFile = None
+    params: kinds.OptionalFile = None
     """Tuned parameters, before what the scenario tells; --told-noise-px goes before both."""
-    json: OptionalFile = None
+    json: kinds.OptionalFile = None
     """Write all numbers, each with its 95 % interval, into this file after every row."""
-    resume: Switch = False
+    resume: kinds.Switch = False
     """Keep the rows that --json holds already."""
 
     def __post_init__(self) -> None:
@@ -181,13 +163,13 @@ class TuneFilter(ScenarioCarFiles):
     """What part of every recording is learned from; the rest is held against the result."""
     scenario: Scenario = "paper"
     """What happens in simulated drives."""
-    corner_noise_px: CornerSigma = 1.0
+    corner_noise_px: kinds.CornerSigma = 1.0
     """Of simulated drives."""
-    seeds: Count = 64
+    seeds: kinds.Count = 64
     """Simulated drives to learn from."""
-    held_out_seeds: Count = 32
+    held_out_seeds: kinds.Count = 32
     """Simulated drives that decide when to stop."""
-    test_seeds: Count = 200
+    test_seeds: kinds.Count = 200
     """Simulated drives for the report."""
     seed: Annotated[int, Interval(ge=0, lt=10**6)] = 0
     """The first seed; test drives count from a million on."""
@@ -199,12 +181,12 @@ class TuneFilter(ScenarioCarFiles):
     and all of R that this selector looks at, of a rig Q."""
     full: _Names = ()
     """Those that are to be whole matrices."""
-    params: OptionalFile = None
+    params: kinds.OptionalFile = None
     """Where to start: a file of parameters."""
-    selector: Believed = "multi-hypothesis"
-    steps: Count = 150
+    selector: kinds.Believed = "multi-hypothesis"
+    steps: kinds.Count = 150
     """At most so many evaluations."""
-    out: ResultsFolder = Path("tuned")
+    out: kinds.ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -241,35 +223,35 @@ class TuneController(ScenarioCarFiles):
     """What happens in the drives to learn from."""
     test_scenario: tuple[Scenario, ...] = ("paper", "slip", "miscalibrated")
     """What happens in the drives for the report."""
-    corner_noise_px: CornerSigma = 1.0
+    corner_noise_px: kinds.CornerSigma = 1.0
     """Standard deviation of the corners."""
-    seeds: Count = 256
+    seeds: kinds.Count = 256
     """Drives a step; from 256 on they run on all cores, in a program that compiles for minutes."""
-    held_out_seeds: Count = 128
+    held_out_seeds: kinds.Count = 128
     """Drives that decide when to stop, the same in every step."""
-    test_seeds: Count = 200
+    test_seeds: kinds.Count = 200
     """Drives of each scenario for the report."""
-    seed: Seed = 0
+    seed: kinds.Seed = 0
     """Of all drives."""
-    time: NotNegative = 0.03
+    time: kinds.NotNegative = 0.03
     """Weight of the time to the last waypoint, 1/s."""
-    cross_track: NotNegative = 2.0
+    cross_track: kinds.NotNegative = 2.0
     """Weight of the RMS distance from the straight lines, 1/m."""
-    effort: NotNegative = 0.13
+    effort: kinds.NotNegative = 0.13
     """Weight of the squared commands, in parts of their limits, over time, 1/s."""
-    smoothness: NotNegative = 0.045
+    smoothness: kinds.NotNegative = 0.045
     """Weight of the squared changes of the commands from frame to frame."""
     train: _Names = ()
     """Parameters to learn; by default of a car p1, p2, its bound, look-ahead and slowing down in
     turns, of another base its speed, how it slows down, and how fast it turns on the spot."""
-    params: OptionalFile = None
+    params: kinds.OptionalFile = None
     """Where to start: a file of parameters."""
-    selector: Believed = "multi-hypothesis"
-    steps: Count = 40
+    selector: kinds.Believed = "multi-hypothesis"
+    steps: kinds.Count = 40
     """At most so many."""
-    learning_rate: Positive = 0.25
+    learning_rate: kinds.Positive = 0.25
     """Of Adam, at the first step; a tenth of it at the last."""
-    out: ResultsFolder = Path("tuned")
+    out: kinds.ResultsFolder = Path("tuned")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -294,15 +276,15 @@ class RunStudy:
     """YAML file with `trials`, `axes` and what is fixed; or a name; or `list`."""
     out: Annotated[Path | None, optional("STORE", "(default: out/CONFIG.zarr)")] = None
     """Where the result goes, or goes on."""
-    workers: Annotated[Count | None, optional("N", "(default: this process)", int)] = None
+    workers: Annotated[kinds.Count | None, optional("N", "(default: this process)", int)] = None
     """Start so many Dask workers on this machine."""
     scheduler: Annotated[str | None, optional("ADDRESS", constructor=str)] = None
     """Run on the Dask cluster with its scheduler there, e.g. tcp://127.0.0.1:8786."""
-    chunk_trials: Annotated[Count | None, optional("N", "(default: 65536, or 256 drives)", int)] = (
-        None
-    )
+    chunk_trials: Annotated[
+        kinds.Count | None, optional("N", "(default: 65536, or 256 drives)", int)
+    ] = None
     """How many trials are run and written at a time. Changes no result."""
-    headless: Headless = False
+    headless: kinds.Headless = False
 
     def __post_init__(self) -> None:
         own = self.workers is None or self.scheduler is None
@@ -320,11 +302,11 @@ class StudyReliability:
 
     recording: Annotated[tyro.conf.Positional[Path | None], optional("RECORDING")] = None
     """Folder, ROS 1 bag (.bag, .bag.bz2) or .npz."""
-    selector: Selector = "multi-hypothesis"
+    selector: kinds.Selector = "multi-hypothesis"
     """Whose probabilities, on a recording."""
-    frames: Count = 165_000
+    frames: kinds.Count = 165_000
     """How many random views."""
-    seed: Seed = 0
+    seed: kinds.Seed = 0
     """Of the random views."""
-    out: ResultsFolder = Path("out")
-    headless: Headless = False
+    out: kinds.ResultsFolder = Path("out")
+    headless: kinds.Headless = False

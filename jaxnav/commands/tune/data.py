@@ -3,6 +3,7 @@ length: cut, padded, and stacked."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,14 +147,13 @@ def _judging(
         named = _sequences(args, path, part)
         if bool(jnp.any(named.recorded.judged)):
             name = named.name if part == (0.0, 1.0) else f"{named.name}, {part[0]:g} to {part[1]:g}"
-            tuning_tests.append(
-                TuningTest(name, named.navigator, len(named.recorded), _known(named.recorded))
-            )
+            size, known = len(named.recorded), partial(_known, named.recorded)
+            tuning_tests.append(TuningTest(name, named.navigator, size, known))
     return tuning_tests
 
 
-def _known(recorded: FrameSequences) -> Callable[[Progress], FrameSequences]:
-    return lambda progress: recorded
+def _known(recorded: FrameSequences, progress: Progress) -> FrameSequences:
+    return recorded
 
 
 def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedSequences:
@@ -282,12 +282,8 @@ def _stacked(
     }
     if recording.odometry is not None:
         fields["twist"] = np.array([recording.odometry.twists(piece) for piece in stamps_ns])
-    truth, judged, reference = (
-        np.array(_IDENTITY),
-        np.zeros(frames.shape, bool),
-        recording.reference,
-    )
-    if reference is not None:
+    truth, judged = np.array(_IDENTITY), np.zeros(frames.shape, bool)
+    if (reference := recording.reference) is not None:
         known = reference.valid[frames]
         judged = used & known & visible.any(axis=(2, 3))
         Ts = poses_in_world(reference.T_world_vehicle[frames], opposite(recording.markers.origin_m))
@@ -359,26 +355,14 @@ def _apart(one: NamedSequences, other: NamedSequences) -> str | None:
     with_twist = [named.recorded.obs.twist is not None for named in (one, other)]
     if with_twist[0] != with_twist[1]:
         return "must both have odometry, or neither, to be tuned on together"
-    if not _alike(one.recorded, other.recorded):
+    # Trees of the same structure, whatever their leaves hold.
+    if not eqx.tree_equal(*(jax.tree.map(lambda _: 0, of.recorded) for of in (one, other))):
         return "must be of one kind to be tuned on together, drives or recordings of a rig"
-    for what, flag, here, there in (
-        ("rig", "--rig", _rig(one.navigator), _rig(other.navigator)),
-        ("vehicle", "--vehicle", _vehicle(one.navigator), _vehicle(other.navigator)),
-    ):
-        if not eqx.tree_equal(here, there, rtol=1e-6, atol=1e-6):
-            return f"must have the same {what} to be tuned on together; {flag} gives them one"
+    navigators = one.navigator, other.navigator
+    # The parts on which poses depend; image sizes may be guesses from the corners seen.
+    rigs = ((of.rig.cameras, of.rig.Ts_camera_vehicle) for of in navigators)
+    vehicles = (getattr(of.motion, "vehicle", None) for of in navigators)
+    for what, parts in (("rig", rigs), ("vehicle", vehicles)):
+        if not eqx.tree_equal(*parts, rtol=1e-6, atol=1e-6):
+            return f"must have the same {what} to be tuned on together; --{what} gives them one"
     return None
-
-
-def _rig(navigator: Navigator) -> Any:
-    """The parts on which poses depend; image sizes may be guesses from the corners seen."""
-    return navigator.rig.cameras, navigator.rig.Ts_camera_vehicle
-
-
-def _vehicle(navigator: Navigator) -> Any:
-    return getattr(navigator.motion, "vehicle", None)
-
-
-def _alike(one: Any, other: Any) -> bool:
-    """Whether two trees have the same structure, whatever their leaves hold."""
-    return bool(eqx.tree_equal(*(jax.tree.map(lambda _: 0, tree) for tree in (one, other))))
