@@ -38,7 +38,7 @@ def run(args: CalibrateRig | CalibrateMarkers | CalibrateCheck) -> int:
     configure_jax(float64=True)
     if isinstance(args, CalibrateCheck):
         return _check(args)
-    data = read_rig_data(args.recordings, args.rig, args.markers, args.marker_size_m, args.family)
+    data = read_rig_data(args, args.marker_size_m)
     if isinstance(args, CalibrateRig):
         calibration = _find_cameras(args, data)
     else:
@@ -146,9 +146,7 @@ def _tied_to_drive(
 
 def _check(args: CalibrateCheck) -> int:
     """Compare the map with the recordings, and name wrong markers."""
-    data = read_rig_data(
-        args.recordings, args.rig, args.markers, None, args.family, only_known=True
-    )
+    data = read_rig_data(args, only_known=True)
     if len(data.known) < 2:
         raise BadInput(
             args.markers or args.recordings[0],

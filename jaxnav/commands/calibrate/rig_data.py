@@ -16,13 +16,16 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration
 from jaxnav.calibrate.rig.views import RigViews, Ts_vehicle_camera, inverted, turn_rad
+from jaxnav.commands.calibrate.arguments import CalibrateCheck, CalibrateMarkers, CalibrateRig
+from jaxnav.commands.reading import given_files
 from jaxnav.commands.report import provenance
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.origin import poses_in_world
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.detection.observe import marker_keys
 from jaxnav.errors import BadInput
-from jaxnav.files import load_markers, load_rig, save_markers, save_rig, write_tum
+from jaxnav.files import save_markers, save_rig, write_tum
 from jaxnav.files.markers import MarkerSigma, marker_map
 from jaxnav.files.poses import pose_from_matrix
 from jaxnav.files.provenance import Calibrated
@@ -64,26 +67,25 @@ class RigData:
 
 
 def read_rig_data(
-    recordings: Sequence[Path],
-    rig_file: Path | None,
-    markers_file: Path | None,
-    marker_size_m: float | None,
-    family: str | None,
+    args: CalibrateRig | CalibrateMarkers | CalibrateCheck,
+    marker_size_m: float | None = None,
     only_known: bool = False,
 ) -> RigData:
     """Read all recordings and join their sightings, one recording after the other.
 
     Args:
-        only_known: whether to leave out markers that are in no map.
+        marker_size_m: side of the markers that are in no map.
+        only_known: whether to leave these out.
 
     Raises:
         BadInput: names the file or the flag.
     """
+    recordings, family = args.recordings, args.family
     if family is not None and family not in FAMILY_SIZES:
         raise BadInput("--family", f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
-    rig = None if rig_file is None else load_rig(rig_file)
-    markers = None if markers_file is None else load_markers(markers_file)
-    parts = [read_sightings(path, rig) for path in recordings]
+    given = given_files(args, ("rig", "markers"))
+    markers = given.get("markers")
+    parts = [read_sightings(path, given.get("rig")) for path in recordings]
     for part, path in zip(parts[1:], recordings[1:], strict=True):
         if part.rig.names != parts[0].rig.names:
             problem = f"its cameras are not those of {recordings[0]}: give one --rig for all"
@@ -93,8 +95,11 @@ def read_rig_data(
     if family is None:
         of_map = set() if markers is None else set(markers.families)
         family = of_map.pop() if len(of_map) == 1 else "tag36h11"
-    seen = Counter(key for part in parts for key in _keys(part, family))
-    keys = tuple(sorted(key for key in seen if _wanted(key, seen[key], markers, only_known)))
+    seen_keys = [key for part in parts for key in _keys(part, family)]
+    seen, mapped = Counter(seen_keys), () if markers is None else marker_keys(markers)
+    # An id that is seen more rarely is another pattern, taken for a marker.
+    often = {key for key, count in seen.items() if count >= _LEAST_SIGHTINGS and not only_known}
+    keys = tuple(sorted(key for key in seen if key in mapped or key in often))
     if not keys:
         what = "a marker of the map" if only_known else "a marker often enough"
         raise BadInput(", ".join(map(str, recordings)), f"no camera saw {what}")
@@ -109,9 +114,9 @@ def read_rig_data(
                 f"none of its markers ({', '.join(map(str, markers.ids))}) was seen; seen were "
                 f"{', '.join(map(str, ids[:_MOST_LISTED]))}{more}"
             )
-            raise BadInput(markers_file or "--markers", problem)
+            raise BadInput(args.markers or "--markers", problem)
         known = {index_of[seen.most_common(1)[0][0]]: np.eye(4)}
-    marker = np.array([index_of.get(key, -1) for part in parts for key in _keys(part, family)], int)
+    marker = np.array([index_of.get(key, -1) for key in seen_keys], int)
     used = marker >= 0
     firsts = np.cumsum([0, *(len(part.stamps_ns) for part in parts)])
     frame = np.concatenate([part.frame + n for part, n in zip(parts, firsts, strict=False)])
@@ -136,13 +141,6 @@ def _one_after_the_other(stamps_ns: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate(together)
 
 
-def _wanted(key: MarkerKey, count: int, markers: MarkerMap | None, only_known: bool) -> bool:
-    if markers is not None and markers.index(key[1], key[0]) is not None:
-        return True
-    # An id that is seen more rarely is another pattern, taken for a marker.
-    return count >= _LEAST_SIGHTINGS and not only_known
-
-
 def _keys(part: RecordedSightings, family: str) -> list[MarkerKey]:
     families = part.families or (family,) * len(part.ids)
     return [(name, int(marker_id)) for name, marker_id in zip(families, part.ids, strict=True)]
@@ -152,21 +150,22 @@ def _known(
     markers: MarkerMap | None, keys: Sequence[MarkerKey], marker_size_m: float | None
 ) -> tuple[dict[int, np.ndarray], list[float]]:
     """T_world_marker (4, 4) of the known markers by index, and the sizes of all, m."""
-    known, sizes_m = {}, []
-    given = [] if markers is None else sorted({float(size) for size in markers.size_m})
+    given, given_m, known, sizes_m = {}, list[float](), {}, []
+    if markers is not None:
+        Ts_world_marker = np.array(markers.Ts_world_marker.as_matrix(), float)
+        Ts_world_marker[:, :3, 3] += markers.origin_m
+        given_m = np.asarray(markers.size_m, float).tolist()
+        placed = zip(Ts_world_marker, given_m, strict=True)
+        given = dict(zip(marker_keys(markers), placed, strict=True))
     for index, (family, marker_id) in enumerate(keys):
-        place = None if markers is None else markers.index(marker_id, family)
-        if place is not None:
-            assert markers is not None
-            T = markers.Ts_world_marker.as_matrix()[place]
-            known[index] = np.array(T, float)
-            known[index][:3, 3] += markers.origin_m
-            sizes_m.append(float(markers.size_m[place]))
-        elif marker_size_m is not None or len(given) == 1:
-            sizes_m.append(given[0] if marker_size_m is None else marker_size_m)
+        if (family, marker_id) in given:
+            known[index], size_m = given[family, marker_id]
+        elif marker_size_m is not None or len(set(given_m)) == 1:
+            size_m = given_m[0] if marker_size_m is None else marker_size_m
         else:
             problem = f"missing: how large is marker {marker_id} ({family}), which is in no map?"
             raise BadInput("--marker-size-m", problem)
+        sizes_m.append(size_m)
     return known, sizes_m
 
 

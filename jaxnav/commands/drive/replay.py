@@ -1,8 +1,6 @@
 """`jaxnav replay`: localise a recorded rig in every frame, or drive a recorded drive again."""
 
 import dataclasses
-from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,19 +10,12 @@ from jaxnav.commands.drive import replay_drive
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.reading import given_files
 from jaxnav.commands.report import corners_in_world, write_report
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible
-from jaxnav.files import (
-    apply_params,
-    load_markers,
-    load_params,
-    load_rig,
-    load_topics,
-    output_folder,
-    write_tum,
-)
+from jaxnav.files import apply_params, output_folder, write_tum
 from jaxnav.recordings.other.odometry_delay import odometry_delay
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
@@ -42,9 +33,9 @@ def run(args: Arguments) -> int:
         return replay_drive.run(args)
     args = dataclasses.replace(args, selector=args.selector or _DEFAULT_SELECTOR)
     configure_jax(float64=True, threads=1)
-    params = _loaded(load_params, args.params)
-    files = (load_rig, args.rig), (load_markers, args.markers), (load_topics, args.topics)
-    recording = read_recording(args.recording, *(_loaded(*file) for file in files))
+    files = given_files(args, ("params", "rig", "markers", "topics"))
+    params, *others = (files.get(name) for name in ("params", "rig", "markers", "topics"))
+    recording = read_recording(args.recording, *others)
     if args.limit is not None:
         recording = recording.first(args.limit)
     if args.without_odometry:
@@ -81,11 +72,6 @@ def run(args: Arguments) -> int:
     lines.append(f"report in {visible(out)}")
     write_report(out, summary, lines, report=_picture(recording, result, _text(summary)))
     return 0
-
-
-def _loaded(load: Callable[[Path], Any], path: Path | None) -> Any:
-    """The content of a file; None where none is given."""
-    return None if path is None else load(path)
 
 
 def _summary(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
-from jaxnav.commands.reading import read_shown
+from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.commands.simulate.arguments import TuneFilter as Arguments
 from jaxnav.commands.simulate.scenario_car import ScenarioCar
 from jaxnav.core.filter.free import ConstantVelocity
@@ -27,7 +27,6 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.errors import BadInput
 from jaxnav.experiments.tuning.recorded import FrameSequences, simulate_sequences
-from jaxnav.files import load_markers, load_rig
 from jaxnav.recordings.drive_events import DriveEvents, refused_odometry
 from jaxnav.recordings.drive_log import DriveLog
 from jaxnav.recordings.drive_setup import DriveSetup
@@ -161,11 +160,8 @@ def _sequences(args: Arguments, path: Path, part: tuple[float, float]) -> NamedS
         log = read_shown(path, args.headless)
         setup = DriveSetup.from_header(log.header, path)
         return NamedSequences(str(path), setup.navigator(), sequences_of_drive(log, setup, part))
-    recording = read_recording(
-        path,
-        None if args.rig is None else load_rig(args.rig),
-        None if args.markers is None else load_markers(args.markers),
-    )
+    given = given_files(args, ("rig", "markers"))
+    recording = read_recording(path, given.get("rig"), given.get("markers"))
     navigator = navigator_of(recording, args.selector)
     return NamedSequences(str(path), navigator, sequences_of_recording(recording, part))
 
