@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxnav.commands.doctor.findings import Finding, Report, found, listed, said
 from jaxnav.commands.drive.arguments import Doctor
-from jaxnav.commands.drive.delay_watch import delays_of, describe_delay, warnings
+from jaxnav.commands.drive.observers import delay_warnings, delays_of, describe_delay
 from jaxnav.commands.kinds import key_values
 from jaxnav.drive import plugins
 from jaxnav.drive.camera_delays import HARMLESS_S
@@ -394,7 +394,7 @@ def stamps(path: Path) -> Iterator[Finding]:
     setup = DriveSetup.from_header(log.header, path)
     setup.car(path)
     delays = delays_of(log, setup)
-    for text in warnings(delays, setup):
+    for text in delay_warnings(delays, setup):
         what, _, do = text.partition(": ")
         yield found("stamps.late", what=what, do=do)
     for name, one in zip(setup.rig.names, delays.delays, strict=True):

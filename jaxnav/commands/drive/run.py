@@ -17,8 +17,8 @@ import jax
 import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
-from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.observers import (
+    DelayWatch,
     DriveObserver,
     DriveRecorder,
     ExposureWatch,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Key
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.arguments import TuneController as Arguments
-from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.commands.simulate.simulate import ScenarioCar
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.models.vehicle import TwistBase

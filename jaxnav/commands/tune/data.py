@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.reading import given_files, read_shown
 from jaxnav.commands.simulate.arguments import TuneFilter as Arguments
-from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.commands.simulate.simulate import ScenarioCar
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.selectors import make_selector

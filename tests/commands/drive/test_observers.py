@@ -12,9 +12,9 @@ import pytest
 
 from jaxnav import cli
 from jaxnav.commands.drive.arguments import Run
-from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.observers import (
     WIDTH,
+    DelayWatch,
     DriveRecorder,
     ExposureWatch,
     LearntWatch,

@@ -10,8 +10,7 @@ from jaxnav.cli import main
 from jaxnav.commands.kinds import Selector, SimulatedSelector
 from jaxnav.commands.simulate.arguments import Scenario
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
-from jaxnav.commands.simulate.scenario_car import ScenarioCar
-from jaxnav.commands.simulate.simulate import _navigator
+from jaxnav.commands.simulate.simulate import ScenarioCar, _navigator
 from jaxnav.core.filter.selectors import SELECTORS
 from jaxnav.core.parameters import parameters_of
 from jaxnav.files import load_params, write_params
