@@ -27,7 +27,9 @@ _ADVICE = (
 def run(args: CalibrateBoard) -> int:
     """Write the board as PDF, PNG and YAML, and a report that says how to check the print."""
     configure_jax(float64=True)
-    paper_mm = _paper_mm(args)
+    width_mm, height_mm = args.paper_size_mm or PAPERS_MM[args.paper.lower()]
+    turned = args.landscape and width_mm <= height_mm
+    paper_mm = (height_mm, width_mm) if turned else (width_mm, height_mm)
     board = _board(args, paper_mm)
     folder = output_folder(args.out)
     words = str(board)
@@ -62,12 +64,6 @@ def run(args: CalibrateBoard) -> int:
         f"jaxnav calibrate intrinsics FOLDER --board {folder / 'board.yaml'}"
     )
     return 0
-
-
-def _paper_mm(args: CalibrateBoard) -> tuple[float, float]:
-    width_mm, height_mm = args.paper_size_mm or PAPERS_MM[args.paper.lower()]
-    lies = width_mm > height_mm
-    return (height_mm, width_mm) if args.landscape and not lies else (width_mm, height_mm)
 
 
 def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:

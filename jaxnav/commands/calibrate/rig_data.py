@@ -239,7 +239,12 @@ class RigResults:
                 cameras=calibration.cameras,
                 Ts_camera_vehicle=jaxlie.SE3(jnp.asarray(np.stack(poses), float)),
             )
-            cameras = [self._camera_sigma(camera) for camera in range(C)]
+            cameras = [
+                CameraSigma(**_placed_sigma(self.sigmas[c]), **self._lens_sigma(c))
+                if calibration.calibrated[c]
+                else CameraSigma()
+                for c in range(C)
+            ]
             save_rig(out / "rig.yaml", rig, self.calibrated, cameras)
         # The check takes no place as given.
         given = data.known if data.anchored and self.command != "check" else {}
@@ -252,11 +257,6 @@ class RigResults:
         poses = [pose_from_matrix(T) for T in calibration.Ts_world_vehicle]
         write_tum(out / "trajectory.tum", calibration.views.stamps_ns / 1e9, np.stack(poses))
         return names
-
-    def _camera_sigma(self, camera: int) -> CameraSigma:
-        if not self.calibration.calibrated[camera]:
-            return CameraSigma()
-        return CameraSigma(**_placed_sigma(self.sigmas[camera]), **self._lens_sigma(camera))
 
     def _with_unseen(self) -> tuple[MarkerMap, int]:
         """The found map with the given map's unseen markers added where they are, and how many

@@ -268,7 +268,11 @@ def delay_warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     camera_delays, together = delays.delays, delays.common_delay
     file_s = Corrections.of(setup.vehicle).camera_delay_s
     known = [one for one in camera_delays if one.known]
-    if together.late and len(known) != 1 and all(_agree(one, together) for one in known):
+    agree = all(
+        abs(one.delay_s - together.delay_s) < 3 * math.hypot(one.sigma_s, together.sigma_s)
+        for one in known
+    )
+    if together.late and len(known) != 1 and agree:
         delay_s = file_s + together.delay_s
         do = f"set camera_delay_s to {delay_s:.3f} in vehicle.yaml"
         yield f"the cameras are {describe_delay(together)}: {do}"
@@ -289,11 +293,6 @@ def describe_delay(delay: Delay) -> str:
     way = "later" if delay.delay_s > 0 else "earlier"
     off_ms, sigma_ms = abs(delay.delay_s) * 1e3, max(delay.sigma_s * 1e3, 1.0)
     return f"{off_ms:.0f} +- {sigma_ms:.0f} ms {way} than stamps say"
-
-
-def _agree(one: Delay, together: Delay) -> bool:
-    apart_s = abs(one.delay_s - together.delay_s)
-    return apart_s < 3 * math.hypot(one.sigma_s, together.sigma_s)
 
 
 def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:

@@ -142,8 +142,7 @@ class _Node:
             self._prepared.close()
         self._prepared = None
 
-    def _shutdown(self) -> None:
-        self._cleanup()
+    _shutdown = _cleanup
 
     def _stop(self, reason: str) -> None:
         activity, self._activity = self._activity, None

@@ -5,6 +5,7 @@ import hashlib
 import os
 from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,16 +82,12 @@ def _cluster(args: Arguments, stack: ExitStack) -> Any:
         _hand_down_the_cache()
         return stack.enter_context(local_cluster(args.workers))
     if args.scheduler is not None:
-        client = stack.enter_context(remote_cluster(args.scheduler, prepare_worker))
+        prepare = partial(configure_jax, float64=False)  # JAX in a worker, as in this process
+        client = stack.enter_context(remote_cluster(args.scheduler, prepare))
         if "dashboard" in client.scheduler_info()["services"]:
             print(f"dashboard: {client.dashboard_link}", flush=True)
         return client
     return None
-
-
-def prepare_worker() -> None:
-    """Configure JAX in a worker of a remote cluster as in this process."""
-    configure_jax(float64=False)
 
 
 def _hand_down_the_cache() -> None:
