@@ -216,12 +216,11 @@ def test_help_takes_little_more_than_what_reads_the_command_line() -> None:
 @pytest.mark.parametrize(
     "command", ["replay", "plot", "calibrate rig", "study ambiguity", "tune filter", "demo --out"]
 )
-def test_a_name_that_is_too_long_is_one_line(command: str, tmp_path: Path) -> None:
-    run = subprocess.run(
-        [*JAXNAV, *command.split(), "x" * 300], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert run.returncode == cli.EXIT_BAD_INPUT
-    last = run.stderr.splitlines()[-1]
+def test_a_name_that_is_too_long_is_one_line(command, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxnav.commands.process.configure", lambda **_: None)
+    assert cli.main([*command.split(), "x" * 300]) == cli.EXIT_BAD_INPUT
+    last = capsys.readouterr().err.splitlines()[-1]
     assert last.endswith("file name too long")
     assert f"jaxnav {command.split()[0]}: xxx" in last
 
