@@ -213,7 +213,7 @@ def cost_table(out: Path) -> None:
             functools.partial(gradient, start),
         )
 
-    from jaxnav.commands.tune.arguments import TuneController
+    from jaxnav.commands.simulate.arguments import TuneController
     from jaxnav.commands.tune.controller import closed_loop, gains_of
 
     args = TuneController(headless=True)
@@ -252,7 +252,7 @@ def _print_cost(
 
 def _filter_loss(seeds: int) -> tuple[Any, Any, Any]:
     """The likelihood of drives, Q ten times too large and R ten times too small."""
-    from jaxnav.commands.tune.arguments import TuneFilter
+    from jaxnav.commands.simulate.arguments import TuneFilter
     from jaxnav.files.configuration import configure
 
     configure(float64=False)

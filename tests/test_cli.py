@@ -17,7 +17,6 @@ from jaxnav.commands import COMMANDS, names
 from jaxnav.commands.drive.arguments import Locate, ReplayRecording
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.errors import BadInput
-from jaxnav.files import configuration
 
 JAXNAV = [sys.executable, "-c", "import sys; from jaxnav.cli import main; sys.exit(main())"]
 
@@ -39,23 +38,14 @@ def command(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable], list]:
 
 def test_arguments_reach_the_command(command) -> None:
     received = command(lambda: 0)
-    assert (
-        cli.main(
-            "demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x --params p.yaml".split()
-        )
-        == 0
-    )
-    assert cli.main("replay --limit 5 --one-at-a-time --markers m.yaml bag".split()) == 0
-    assert cli.main("locate a.png --camera c.yaml --marker-size-m 0.1 --as-json".split()) == 0
+    for typed in (
+        "demo --seed 3 --no-blur --exposure-ms 2 --rig a.yaml --out x",
+        "replay --limit 5 --one-at-a-time --markers m.yaml bag",
+        "locate a.png --camera c.yaml --marker-size-m 0.1 --as-json",
+    ):
+        assert cli.main(typed.split()) == 0
     assert received == [
-        Demo(
-            seed=3,
-            blur=False,
-            exposure_ms=2.0,
-            rig=Path("a.yaml"),
-            out=Path("x"),
-            params=Path("p.yaml"),
-        ),
+        Demo(seed=3, blur=False, exposure_ms=2.0, rig=Path("a.yaml"), out=Path("x")),
         ReplayRecording(Path("bag"), limit=5, one_at_a_time=True, markers=Path("m.yaml")),
         Locate(Path("a.png"), camera=Path("c.yaml"), marker_size_m=0.1, as_json=True),
     ]
@@ -89,6 +79,8 @@ def test_the_exit_code_is_the_commands(command) -> None:
             "locate a.png --camera c --marker-size-m -0.1",
             "jaxnav locate: --marker-size-m: must be from 0.001 to 100 m, got -0.1",
         ),
+        ("tune filter --seeds 0", "jaxnav tune: --seeds: must be at least 1, got 0"),
+        ("calibrate rig", "jaxnav calibrate: RECORDING: missing: what has the rig seen?"),
     ],
 )
 def test_wrong_usage_gets_one_line(arguments, line, command, capsys) -> None:
@@ -122,44 +114,28 @@ def test_the_line_is_the_same_under_every_encoding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "line"),
+    ("raised", "code", "line"),
     [
-        (["simulate", "--seeds", "0"], "jaxnav simulate: --seeds: must be at least 1, got 0\n"),
-        (["tune", "filter", "--seeds", "0"], "jaxnav tune: --seeds: must be at least 1, got 0\n"),
-        (["calibrate", "rig"], "jaxnav calibrate: RECORDING: missing: what has the rig seen?\n"),
+        (
+            BadInput("rig.yaml: cameras[1].lens", "unknown lens 'fish'\nexpected one of ..."),
+            cli.EXIT_BAD_INPUT,
+            "jaxnav demo: rig.yaml: cameras[1].lens: unknown lens 'fish' expected one of ...\n",
+        ),
+        (KeyboardInterrupt(), cli.EXIT_INTERRUPTED, "jaxnav demo: interrupted\n"),
+        (ZeroDivisionError(), None, ""),  # a defect keeps its traceback
     ],
 )
-def test_a_bad_flag_is_named_as_it_was_typed(words, line, capsys) -> None:
-    assert cli.main(words) == cli.EXIT_BAD_INPUT
+def test_what_a_command_raises_gets_one_line(command, capsys, raised, code, line) -> None:
+    def run() -> int:
+        raise raised
+
+    command(run)
+    if code is None:
+        with pytest.raises(type(raised)):
+            cli.main(["demo"])
+    else:
+        assert cli.main(["demo"]) == code
     assert capsys.readouterr() == ("", line)
-
-
-def test_bad_input_gets_one_line(command, capsys) -> None:
-    def run() -> int:
-        raise BadInput("rig.yaml: cameras[1].lens", "unknown lens 'fish'\nexpected one of ...")
-
-    command(run)
-    assert cli.main(["demo"]) == cli.EXIT_BAD_INPUT
-    line = "jaxnav demo: rig.yaml: cameras[1].lens: unknown lens 'fish' expected one of ...\n"
-    assert capsys.readouterr() == ("", line)
-
-
-def test_an_interruption_gets_one_line(command, capsys) -> None:
-    def run() -> int:
-        raise KeyboardInterrupt
-
-    command(run)
-    assert cli.main(["replay", "bag"]) == cli.EXIT_INTERRUPTED
-    assert capsys.readouterr() == ("", "jaxnav replay: interrupted\n")
-
-
-def test_a_defect_keeps_its_traceback(command) -> None:
-    def run() -> int:
-        raise ZeroDivisionError
-
-    command(run)
-    with pytest.raises(ZeroDivisionError):
-        cli.main(["demo"])
 
 
 POSITIONALS = tuple(
@@ -184,12 +160,9 @@ def test_help_explains_every_flag(name, capsys) -> None:
     assert err == ""
     assert "{None}" not in out
     for field in dataclasses.fields(command):
-        is_positional = field.name in POSITIONALS
-        flag = (
-            POSITIONAL.get(field.name, field.name.upper())
-            if is_positional
-            else "--" + field.name.replace("_", "-")
-        )
+        flag = "--" + field.name.replace("_", "-")
+        if field.name in POSITIONALS:
+            flag = POSITIONAL.get(field.name, field.name.upper())
         assert re.search(rf"(?m)^.? ?{flag}(?!\w)", out), flag
     # A flag without a docstring would be followed by its default alone.
     unframed = " ".join(out.replace("│", " ").split())
@@ -243,12 +216,11 @@ def test_help_takes_little_more_than_what_reads_the_command_line() -> None:
 @pytest.mark.parametrize(
     "command", ["replay", "plot", "calibrate rig", "study ambiguity", "tune filter", "demo --out"]
 )
-def test_a_name_that_is_too_long_is_one_line(command: str, tmp_path: Path) -> None:
-    run = subprocess.run(
-        [*JAXNAV, *command.split(), "x" * 300], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert run.returncode == cli.EXIT_BAD_INPUT
-    last = run.stderr.splitlines()[-1]
+def test_a_name_that_is_too_long_is_one_line(command, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxnav.commands.process.configure", lambda **_: None)
+    assert cli.main([*command.split(), "x" * 300]) == cli.EXIT_BAD_INPUT
+    last = capsys.readouterr().err.splitlines()[-1]
     assert last.endswith("file name too long")
     assert f"jaxnav {command.split()[0]}: xxx" in last
 
@@ -294,18 +266,8 @@ def test_a_closed_pipe_is_no_traceback() -> None:
     assert (run.returncode, run.stderr) == (cli.EXIT_BROKEN_PIPE, "")
 
 
-def _configured(environment: dict[str, str], said: str = "") -> list[str]:
-    """What configure_jax(float64=True) leaves: [cache folder or None, default float].
-
-    Args:
-        said: of what stderr has one line; by default it has none.
-    """
-    script = (
-        "import jax, jax.numpy as jnp; from jaxnav.commands.process import configure_jax\n"
-        "configure_jax(float64=True)\n"
-        "jax.jit(lambda x: jnp.linalg.inv(x))(jnp.eye(3)).block_until_ready()\n"
-        "print(jax.config.jax_compilation_cache_dir, jnp.zeros(1).dtype)"
-    )
+def _printed(script: str, **environment: str) -> tuple[str, str]:
+    """What a script prints in a process of its own, and what it says on stderr."""
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_"))}
     run = subprocess.run(
         [sys.executable, "-W", "error", "-c", script],
@@ -314,69 +276,41 @@ def _configured(environment: dict[str, str], said: str = "") -> list[str]:
         text=True,
         check=True,
     )
-    assert said in run.stderr
-    assert len(run.stderr.splitlines()) == (1 if said else 0)
-    return run.stdout.split()
+    return run.stdout.strip(), run.stderr
 
 
-def test_compiled_code_is_kept_for_this_machine_and_jaxlib(tmp_path) -> None:
-    folder, dtype = _configured({"XDG_CACHE_HOME": str(tmp_path)})
-    assert Path(folder).parent == tmp_path / "jaxnav"
-    assert re.match(r"jaxlib-\d+\.\d+\.\d+.*-\w+-", Path(folder).name)
-    assert Path(folder).stat().st_mode & 0o777 == 0o700
-    assert dtype == "float64"
-
-
-def test_an_unusable_cache_folder_is_done_without(tmp_path) -> None:
+@pytest.mark.parametrize(
+    ("environment", "said", "kept"),
+    [
+        ({"XDG_CACHE_HOME": "home"}, "", r"{0}/home/jaxnav/jaxlib-\d+\.\d+\.\d+.*-\w+-"),
+        ({"XDG_CACHE_HOME": "file"}, "compiled code is not kept: {0}/file/jaxnav", "None"),
+        ({"JAX_COMPILATION_CACHE_DIR": "own", "XDG_CACHE_HOME": "home"}, "", "{0}/own"),
+        # Not a byte of it is read: its entries are machine code.
+        ({"JAX_COMPILATION_CACHE_DIR": "open"}, "{0}/open can be written to by all: chmod", "None"),
+        ({"XDG_CACHE_HOME": "open"}, "{0}/open can be written to by all: chmod", "None"),
+    ],
+)
+def test_where_compiled_code_is_kept(tmp_path, environment, said, kept) -> None:
     (tmp_path / "file").write_text("in the way")
-    said = f"compiled code is not kept: {tmp_path}/file/jaxnav"
-    assert _configured({"XDG_CACHE_HOME": str(tmp_path / "file")}, said) == ["None", "float64"]
-
-
-def test_the_users_own_cache_folder_goes_first(tmp_path) -> None:
-    own = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "own"), "XDG_CACHE_HOME": str(tmp_path)}
-    assert _configured(own)[0] == str(tmp_path / "own")
-    assert not (tmp_path / "jaxnav").exists()
-
-
-@pytest.mark.parametrize("variable", ["JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"])
-def test_a_cache_folder_that_others_can_write_to_is_done_without(tmp_path, variable) -> None:
-    """Not a byte of it is read: its entries are machine code."""
-    folder = tmp_path / "open"
-    folder.mkdir()
-    folder.chmod(0o777)
-    said = f"compiled code is not kept: {folder} can be written to by all: chmod go-w {folder}"
-    few = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    assert _configured({variable: str(folder)} | few, said) == ["None", "float64"]
-    assert list(folder.iterdir()) == []
-
-
-def test_cache_folders_that_could_be_somebody_elses_are_refused(tmp_path, capsys) -> None:
-    """The same for JAX's cache and for kept executables, and for what lies in the folder."""
-    good = tmp_path / "good"
-    assert configuration._private(good) == good
-    (good / "entry-cache").write_bytes(b"")
-    good.chmod(0o755)
-    configuration._private.cache_clear()
-    assert configuration._private(good) == good
-    (good / "entry-cache").chmod(0o666)
-    (tmp_path / "link").symlink_to(good)
-    refused = [tmp_path / "link", tmp_path / "link" / "steps", good]
-    if os.geteuid() == 0:
-        (tmp_path / "theirs").mkdir()
-        os.chown(tmp_path / "theirs", 12345, -1)
-        refused += [tmp_path / "theirs", tmp_path / "theirs" / "steps"]
-    (tmp_path / "planted").mkdir()
-    (tmp_path / "planted" / "entry-cache").symlink_to(good / "entry-cache")
-    refused.append(tmp_path / "planted")
-    configuration._private.cache_clear()
-    for folder in refused:
-        assert configuration._private(folder) is None
-        assert configuration._private(folder) is None  # and is said once
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == len(refused)
-    assert all(line.startswith("compiled code is not kept: ") for line in lines)
-    assert configuration.cache_refused() in lines[-1]
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    script = (
+        "import jax, jax.numpy as jnp; from jaxnav.commands.process import configure_jax\n"
+        "configure_jax(float64=True)\n"
+        "jax.jit(lambda x: jnp.linalg.inv(x))(jnp.eye(3)).block_until_ready()\n"
+        "print(jax.config.jax_compilation_cache_dir, jnp.zeros(1).dtype)"
+    )
+    given = {name: str(tmp_path / value) for name, value in environment.items()}
+    out, err = _printed(script, **given, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0")
+    folder, dtype = out.split()
+    assert re.match(kept.format(tmp_path), folder)
+    assert dtype == "float64"
+    assert said.format(tmp_path) in err
+    assert len(err.splitlines()) == bool(said)
+    assert not any((tmp_path / "open").iterdir())
+    assert (tmp_path / "home" / "jaxnav").exists() == (kept.startswith("{0}/home"))
+    if kept.startswith("{0}/home"):
+        assert Path(folder).stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.parametrize(
@@ -389,29 +323,5 @@ def test_a_single_car_is_computed_on_the_processor(tmp_path, threads, asked, pla
         "import jax; from jaxnav.commands.process import configure_jax\n"
         f"configure_jax(float64=False, threads={threads}); print(jax.config.jax_platforms)"
     )
-    assert _printed(script, JAX_PLATFORMS=asked, XDG_CACHE_HOME=str(tmp_path)) == platforms
-
-
-def test_the_users_own_flags_for_xla_are_kept(tmp_path) -> None:
-    script = (
-        "import os; from jaxnav.commands.process import configure_jax\n"
-        "configure_jax(float64=False); print(os.environ['XLA_FLAGS'])"
-    )
-    known = configuration.known_flags(configuration.FLAGS)
-    ours = " ".join(f"--{flag}={value}" for flag, value in known.items())
-    own = "--xla_cpu_multi_thread_eigen=false"
-    reverse = " ".join(reversed(ours.split()))
-    for given, kept in (("", ours), (own, f"{own} {ours}"), (reverse, reverse)):
-        assert _printed(script, XLA_FLAGS=given, XDG_CACHE_HOME=str(tmp_path)) == kept
-
-
-def _printed(script: str, **environment: str) -> str:
-    """What a script prints in a process of its own."""
-    run = subprocess.run(
-        [sys.executable, "-c", script],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return run.stdout.strip()
+    found, _ = _printed(script, JAX_PLATFORMS=asked, XDG_CACHE_HOME=str(tmp_path))
+    assert found == platforms

@@ -12,30 +12,9 @@ from typing import Annotated, Any, NamedTuple, Union
 
 import tyro
 
-from jaxnav.commands.calibrate.arguments import (
-    CalibrateAdopt,
-    CalibrateBoard,
-    CalibrateCheck,
-    CalibrateCompare,
-    CalibrateConvert,
-    CalibrateIntrinsics,
-    CalibrateMarkers,
-    CalibrateOdometry,
-    CalibrateRig,
-)
-from jaxnav.commands.doctor.arguments import Doctor
-from jaxnav.commands.drive.arguments import (
-    Faults,
-    Locate,
-    ReplayRecording,
-    Ros,
-    Run,
-    Stop,
-    ViewDrive,
-)
-from jaxnav.commands.simulate.arguments import Demo, Simulate
-from jaxnav.commands.study.arguments import Plot, RunStudy, StudyReliability
-from jaxnav.commands.tune.arguments import TuneController, TuneFilter
+from jaxnav.commands.calibrate import arguments as of_calibrate
+from jaxnav.commands.drive import arguments as of_drive
+from jaxnav.commands.simulate import arguments as of_simulate
 
 _REPORT = ("report.png", "report.json")
 _MAP = ("markers.yaml", "trajectory.tum", *_REPORT)
@@ -64,50 +43,48 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "demo": Command(
-        Demo, "simulate.demo", in_folder=(*_DROVE, *(f"seed_*/{name}" for name in _DROVE))
-    ),
+    "demo": Command(of_simulate.Demo, "simulate.demo", (*_DROVE, *(f"seed_*/{x}" for x in _DROVE))),
     "replay": Command(
-        ReplayRecording, "drive.replay", in_folder=("*.tum", "report.png", "summary.json")
+        of_drive.ReplayRecording, "drive.replay", ("*.tum", "report.png", "summary.json")
     ),
-    "locate": Command(Locate, "drive.locate", file="out"),
-    "simulate": Command(Simulate, "simulate.simulate", file="json"),
+    "locate": Command(of_drive.Locate, "drive.locate", file="out"),
+    "simulate": Command(of_simulate.Simulate, "simulate.simulate", file="json"),
     "reliability": Command(
-        StudyReliability, "study.reliability", in_folder=("reliability.png", "summary.json")
+        of_simulate.StudyReliability, "study.reliability", ("reliability.png", "summary.json")
     ),
-    "study": Command(RunStudy, "study.study", made="out"),
+    "study": Command(of_simulate.RunStudy, "study.study", made="out"),
     "plot": Command(
-        Plot,
+        of_drive.Plot,
         "drive.plot",
-        in_folder=("drive.png", "map_*.png", "curves*.png", "reliability.png", "summary.json"),
+        ("drive.png", "map_*.png", "curves*.png", "reliability.png", "summary.json"),
     ),
-    "run": Command(Run, "drive.run", made="record"),
-    "stop": Command(Stop, "drive.stop"),
-    "ros": Command(Ros, "drive.ros", made="record"),
-    "faults": Command(Faults, "drive.faults", file="json"),
-    "view": Command(ViewDrive, "drive.view", made="out"),
-    "doctor": Command(Doctor, "doctor.doctor", file="json"),
-    "tune filter": Command(TuneFilter, "tune.filter", in_folder=_TUNED),
-    "tune controller": Command(TuneController, "tune.controller", in_folder=_TUNED),
+    "run": Command(of_drive.Run, "drive.run", made="record"),
+    "stop": Command(of_drive.Stop, "drive.stop"),
+    "ros": Command(of_drive.Ros, "drive.ros", made="record"),
+    "faults": Command(of_drive.Faults, "drive.faults", file="json"),
+    "view": Command(of_drive.ViewDrive, "drive.plot", made="out"),
+    "doctor": Command(of_drive.Doctor, "doctor.doctor", file="json"),
+    "tune filter": Command(of_simulate.TuneFilter, "tune.filter", _TUNED),
+    "tune controller": Command(of_simulate.TuneController, "tune.controller", _TUNED),
     "calibrate board": Command(
-        CalibrateBoard,
+        of_calibrate.CalibrateBoard,
         "calibrate.board",
-        in_folder=("board.pdf", "board.png", "board.yaml", "report.json"),
+        ("board.pdf", "board.png", "board.yaml", "report.json"),
     ),
     "calibrate intrinsics": Command(
-        CalibrateIntrinsics, "calibrate.intrinsics", in_folder=("camera.yaml", *_REPORT)
+        of_calibrate.CalibrateIntrinsics, "calibrate.intrinsics", ("camera.yaml", *_REPORT)
     ),
-    "calibrate compare": Command(CalibrateCompare, "calibrate.compare", in_folder=_REPORT),
-    "calibrate rig": Command(CalibrateRig, "calibrate.rig", in_folder=("rig.yaml", *_MAP)),
-    "calibrate markers": Command(CalibrateMarkers, "calibrate.rig", in_folder=_MAP),
-    "calibrate check": Command(CalibrateCheck, "calibrate.check", in_folder=_MAP),
+    "calibrate compare": Command(of_calibrate.CalibrateCompare, "calibrate.compare", _REPORT),
+    "calibrate rig": Command(of_calibrate.CalibrateRig, "calibrate.rig", ("rig.yaml", *_MAP)),
+    "calibrate markers": Command(of_calibrate.CalibrateMarkers, "calibrate.rig", _MAP),
+    "calibrate check": Command(of_calibrate.CalibrateCheck, "calibrate.rig", _MAP),
     "calibrate odometry": Command(
-        CalibrateOdometry, "calibrate.odometry", in_folder=("vehicle.yaml", *_REPORT)
+        of_calibrate.CalibrateOdometry, "calibrate.odometry", ("vehicle.yaml", *_REPORT)
     ),
     "calibrate adopt": Command(
-        CalibrateAdopt, "calibrate.adopt", in_folder=("rig.yaml", "vehicle.yaml", *_REPORT)
+        of_calibrate.CalibrateAdopt, "calibrate.adopt", ("rig.yaml", "vehicle.yaml", *_REPORT)
     ),
-    "calibrate convert": Command(CalibrateConvert, "calibrate.convert"),
+    "calibrate convert": Command(of_calibrate.CalibrateConvert, "calibrate.convert"),
 }
 GROUPS = {
     "tune": "Learn parameters by gradient, through the step that runs on the car.",

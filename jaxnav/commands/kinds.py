@@ -23,29 +23,6 @@ Selector = Literal[
 ]
 # These need what only a simulation has: another sensor, the truth.
 SimulatedSelector = Literal[Selector, "orientation-given", "oracle", "all"]
-Scenario = Literal[
-    "paper",
-    "static",
-    "approach",
-    "orbit",
-    "tunnel",
-    "long-tunnel",
-    "kidnapped",
-    "slip",
-    "slip-30",
-    "gyro-late",
-    "miscalibrated",
-    "blur",
-    "late",
-    "drifting-corners",
-    "each-camera-off",
-    "uneven-wheels",
-    "everything",
-    "as-told",
-]
-Base = Literal["ackermann", "differential", "omni"]
-Imu = Literal["none", "consumer", "tactical"]
-StudyKind = Literal["ambiguity", "drive"]
 CornerBackend = Literal["aruco", "apriltag"]
 Switch = tyro.conf.FlagCreatePairsOff[bool]
 
@@ -183,24 +160,3 @@ Following = Annotated[
 Float64 = Annotated[Switch, tyro.conf.arg(help="Estimate in double precision.")]
 Headless = Annotated[Switch, tyro.conf.arg(help="No progress bar.")]
 ResultsFolder = Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for the results.")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScenarioCarFiles:
-    """Arguments of every command that drives through scenarios: its car, in files or by name."""
-
-    base: Base = "ackermann"
-    """What drives: the vehicle, or a base of the QCar's size that is commanded by a twist."""
-    imu: Imu = "none"
-    """The vehicle's gyro: as its file says, or one of that class, with errors drawn anew for each
-    drive."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarVehicle = None
-    route: Annotated[Path | None, optional("FILE", "(default: the scenario's own)")] = None
-    """Start and waypoints that go with another marker map."""
-    headless: Headless = False
-
-    def __post_init__(self) -> None:
-        named = self.base == "ackermann" or self.vehicle is None
-        require(named, "--base", f"{self.base} takes the place of --vehicle: give one of them")

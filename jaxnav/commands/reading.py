@@ -1,6 +1,6 @@
 """Reading of recorded drives, and of files that are given beside them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -8,28 +8,40 @@ from typing import Any
 from jaxnav.commands.bars import FROM_S, progress_bar
 from jaxnav.commands.kinds import flag_of
 from jaxnav.errors import BadInput
-from jaxnav.files import load_markers, load_rig, load_route, load_vehicle
+from jaxnav.files import (
+    calib_dir,
+    load_markers,
+    load_params,
+    load_rig,
+    load_route,
+    load_topics,
+    load_vehicle,
+)
 from jaxnav.recordings.drive_log import DriveLog, read_drive
 
-_LOADS = {
+_LOADS: dict[str, Callable[[Path], Any]] = {
     "rig": load_rig, "markers": load_markers, "vehicle": load_vehicle, "route": load_route,
+    "params": load_params, "topics": load_topics,
 }  # fmt: skip
 
 
-def given_files(args: Any, names: Sequence[str], bag: Path | None = None) -> dict[str, Any]:
-    """The content of the files that are given in place of a recording's own.
+def given_files(
+    args: Any, names: Sequence[str], bag: Path | None = None, or_qcars: bool = False
+) -> dict[str, Any]:
+    """The content of the files that are given, by their names.
 
     Args:
-        args: with the fields rig, markers, vehicle and route, as far as they are asked for.
-        names: those asked for: rig, markers, vehicle, route.
+        args: with the fields that are asked for.
+        names: those asked for: rig, markers, vehicle, route, params, topics.
         bag: a recording that holds none of them, so that all must be given.
+        or_qcars: whether the QCar's file stands for one that is not given.
 
     Raises:
         BadInput: a file that is not valid, or the flag of one that is missing.
     """
     content = {}
     for name in names:
-        path = getattr(args, name)
+        path = getattr(args, name) or (calib_dir() / "qcar" / f"{name}.yaml" if or_qcars else None)
         if path is not None:
             content[name] = _LOADS[name](path)
         elif bag is not None:

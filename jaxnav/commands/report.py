@@ -1,7 +1,7 @@
 """What a command hands over: figures and numbers in files, and lines on the terminal."""
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +11,13 @@ import jaxlie
 import numpy as np
 from jaxtyping import Float
 
+from jaxnav import __version__
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import points_in_world
 from jaxnav.errors import visible
 from jaxnav.files import atomic_path, write_json
+from jaxnav.files.provenance import Calibrated, calibrated_now
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -44,6 +46,28 @@ def write_report(
         save_figure(figure, folder / f"{picture}.png")
     for line in lines:
         print(line, flush=True)
+
+
+def publish(
+    folder: Path,
+    report: dict[str, Any],
+    figure: "Figure",
+    lines: Iterable[str],
+    files: Iterable[str],
+) -> None:
+    """Write report.json and report.png of a `jaxnav calibrate` command, and print what they say.
+
+    Args:
+        files: that were written into the folder before.
+    """
+    where = f"{', '.join([*files, 'report.json', 'report.png'])} in {folder}"
+    shown = [visible(line) for line in (*lines, where)]
+    write_report(folder, report, shown, name="report.json", report=figure)
+
+
+def provenance(command: str, data: Sequence[Path | np.ndarray]) -> Calibrated:
+    """What the files of a `jaxnav calibrate` command state: date, tool, digest of the data."""
+    return calibrated_now(f"jaxnav {__version__} calibrate {command}", data)
 
 
 def save_figure(figure: "Figure", path: Path, dpi: float = PNG_DPI) -> None:

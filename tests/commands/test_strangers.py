@@ -87,9 +87,8 @@ def pictures(stranger, tmp_path_factory) -> dict[str, Path]:
 
 
 @pytest.fixture
-def here(monkeypatch, capsys) -> Iterator:
-    """`jaxnav` in this process, which keeps its precision and its cache: exit code, out, err."""
-    monkeypatch.setattr("jaxnav.commands.process.configure", lambda **_: None)
+def here(capsys) -> Iterator:
+    """`jaxnav` in this process: exit code, out, err."""
 
     def run(*arguments: object) -> tuple[int, str, str]:
         code = main([str(argument) for argument in arguments])

@@ -11,9 +11,13 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnav.commands.doctor import cameras
-from jaxnav.commands.drive import delay_watch
-from jaxnav.commands.drive.delay_watch import DelayWatch, delays_of, warnings
+from jaxnav.commands.doctor import plug_ins
+from jaxnav.commands.drive.observers import (
+    DelayWatch,
+    delay_warnings,
+    delays_of,
+    describe_delay,
+)
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.detection import Detections
 from jaxnav.drive.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
@@ -150,7 +154,7 @@ def test_what_is_harmless_or_no_delay_is_not_told_as_one(wrong, seed):
 def test_one_camera_alone_is_told_by_its_name():
     delays = found_on(Drive(0.06, cameras=(0,)))
     assert delays.delays[0].late
-    lines = list(warnings(delays, SETUP))
+    lines = list(delay_warnings(delays, SETUP))
     assert len(lines) == 1
     assert lines[0].startswith(f"camera {RIG.names[0]!r} is ")
     assert "ms later than stamps say: raise its latency_ms by" in lines[0]
@@ -174,7 +178,7 @@ def test_what_is_corrected_already_is_not_found_again():
     assert not right.late
     assert abs(right.delays[0].delay_s) < HARMLESS_S
     twice = found_on(Drive(0.12), setup)
-    (line,) = warnings(twice, setup)
+    (line,) = delay_warnings(twice, setup)
     number = float(line.split("camera_delay_s to ")[1].split()[0])
     assert number == pytest.approx(0.12, abs=0.02)
 
@@ -266,17 +270,14 @@ def test_of_cameras_in_time_nothing_is_said(capsys):
 
 def test_the_doctor_tells_it_of_a_recorded_drive(monkeypatch):
     path = Path("drive.mcap")
-    monkeypatch.setattr(cameras, "read_drive", lambda _: Drive(0.05).log(SETUP))
-    late = list(cameras.stamps(path))
+    monkeypatch.setattr(plug_ins, "read_drive", lambda _: Drive(0.05).log(SETUP))
+    late = list(plug_ins.stamps(path))
     assert late[0].level == "warning"
     assert "later than stamps say" in late[0].what
     assert "camera_delay_s" in late[0].do
-    monkeypatch.setattr(cameras, "read_drive", lambda _: Drive().log(SETUP))
-    fine = list(cameras.stamps(path))
+    monkeypatch.setattr(plug_ins, "read_drive", lambda _: Drive().log(SETUP))
+    fine = list(plug_ins.stamps(path))
     assert {finding.level for finding in fine} <= {"ok", "note"}
     assert fine[0].level == "ok"
     assert any("does not tell" in finding.what for finding in fine)  # who saw no marker
-    assert (
-        delay_watch.describe_delay(Delay(-0.0304, 0.0004, 2))
-        == "30 +- 1 ms earlier than stamps say"
-    )
+    assert describe_delay(Delay(-0.0304, 0.0004, 2)) == "30 +- 1 ms earlier than stamps say"

@@ -16,7 +16,7 @@ import numpy as np
 from jaxnav import files
 from jaxnav.commands.simulate import simulate
 from jaxnav.commands.simulate.arguments import Simulate
-from jaxnav.commands.study.studies import load_study, summary_of
+from jaxnav.commands.study.study import load_study, summary_of
 from jaxnav.core.models.rig import CameraRig, Timing
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import parameters_of

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from jaxnav.commands.calibrate.arguments import CalibrateAdopt
-from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
+from jaxnav.commands.report import provenance, publish
 from jaxnav.core.models.vehicle import SENSOR_ERRORS
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder
@@ -33,7 +33,13 @@ def run(args: CalibrateAdopt) -> int:
     setup = DriveSetup.from_header(log.header, log.path)
     vehicle = setup.car(log.path)
     given = given_files(args, ("rig", "vehicle"))
-    _refuse_others(args, setup, given)
+    # What was learnt corrects the files that the drive was driven with, and no others.
+    if "rig" in given and is_other_rig(given["rig"], setup.rig):
+        raise BadInput(args.rig, f"{args.recording} was driven with cameras in other places")
+    if args.vehicle is not None and is_other_vehicle(
+        as_car(given["vehicle"], args.vehicle), vehicle
+    ):
+        raise BadInput(args.vehicle, f"{args.recording} was driven with other corrections")
     index = _last_sure(log)
     errors, sigma = log.outcomes.errors, log.outcomes.errors_sigma
     learnt = Learnt.from_errors(errors[index], sigma[index], setup.rig, vehicle)
@@ -55,22 +61,8 @@ def run(args: CalibrateAdopt) -> int:
     return 0
 
 
-def _refuse_others(args: CalibrateAdopt, setup: DriveSetup, given: dict[str, Any]) -> None:
-    """What was learnt corrects the files that the drive was driven with, and no others."""
-    if "rig" in given and is_other_rig(given["rig"], setup.rig):
-        raise BadInput(args.rig, f"{args.recording} was driven with cameras in other places")
-    if args.vehicle is None:
-        return
-    if is_other_vehicle(as_car(given["vehicle"], args.vehicle), setup.car(args.recording)):
-        raise BadInput(args.vehicle, f"{args.recording} was driven with other corrections")
-
-
 def _last_sure(log: DriveLog) -> int:
-    """The last outcome at which the bank knew where it was, and kept errors.
-
-    Raises:
-        BadInput: there is none.
-    """
+    """The last outcome at which the bank knew where it was, and kept errors."""
     outcomes = log.outcomes
     kept = np.isfinite(outcomes.errors).all(axis=1) & (outcomes.errors.shape[1] > 0)
     if not kept.any():

@@ -9,26 +9,14 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Ge, Interval
 
-from jaxnav.commands.kinds import (
-    CornerBackend,
-    Headless,
-    OptionalFile,
-    Positive,
-    QCarFile,
-    ResultsFolder,
-    SizeM,
-    Switch,
-    Within,
-    flag_of,
-    optional,
-    require,
-)
+from jaxnav.commands import kinds
+from jaxnav.commands.kinds import flag_of, optional, require
 
 CalibrationFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision", "wpilib"]
 WPILibFamily = Literal["tag16h5", "tag25h9", "tag36h11"]
 
-_Angle = Annotated[float, Within("angle_deg")]
-_Place = Annotated[float, Within("position_m")]
+_Angle = Annotated[float, kinds.Within("angle_deg")]
+_Place = Annotated[float, kinds.Within("position_m")]
 _NAMED = re.compile(r"([A-Za-z_][\w.\-]{0,99})=(.+)")
 _Count = Annotated[int | None, optional("INT", "(default: as the target and the paper suggest)")]
 Recordings = Annotated[
@@ -39,7 +27,7 @@ Recordings = Annotated[
     ),
 ]
 MarkerSize = Annotated[
-    SizeM | None,
+    kinds.SizeM | None,
     tyro.conf.arg(
         metavar="S",
         constructor=float,
@@ -77,18 +65,18 @@ class CalibrateBoard:
     """What is printed."""
     paper: Annotated[str, tyro.conf.arg(metavar="{a4,a3,letter,WxH}")] = "a4"
     """The paper, or its width and height in mm, as in 600x400."""
-    landscape: Switch = False
+    landscape: kinds.Switch = False
     """The paper's longer side lies."""
     columns: _Count = None
     """Squares or tags side by side."""
     rows: _Count = None
     """Squares or tags one above the other."""
     size_m: Annotated[
-        Positive | None, optional("FLOAT", "(default: the largest round size that fits)")
+        kinds.Positive | None, optional("FLOAT", "(default: the largest round size that fits)")
     ] = None
     """Side of a square, or of the black outline of a tag or marker, m."""
     marker_size_m: Annotated[
-        Positive | None, optional("FLOAT", "(default: a cell of white around it)")
+        kinds.Positive | None, optional("FLOAT", "(default: a cell of white around it)")
     ] = None
     """Of a charuco board, the side of its markers, m."""
     spacing: Annotated[float, Interval(gt=-math.inf, lt=math.inf)] = 0.3
@@ -103,7 +91,7 @@ class CalibrateBoard:
     """Of an aprilgrid, how wide the tags' black frame is; Kalibr reads 2."""
     dpi: Annotated[int, Interval(ge=50, le=2400)] = 300
     """Pixels an inch of the PNG."""
-    out: ResultsFolder = Path("calibrated")
+    out: kinds.ResultsFolder = Path("calibrated")
 
     def __post_init__(self) -> None:
         named = self.paper.lower() in ("a4", "a3", "letter")
@@ -156,10 +144,10 @@ class CalibrateIntrinsics:
     """Of the camera, where the sources don't say it."""
     max_views: Annotated[int, Ge(8)] = 100
     """Of more views those are taken that tell most about the lens."""
-    rig: OptionalFile = None
+    rig: kinds.OptionalFile = None
     """A rig file that says where the cameras are; its other cameras go along unchanged."""
-    out: ResultsFolder = Path("calibrated")
-    headless: Headless = False
+    out: kinds.ResultsFolder = Path("calibrated")
+    headless: kinds.Headless = False
 
     def __post_init__(self) -> None:
         require(bool(self.sources), "SOURCE", "give images, a folder of images or a video")
@@ -204,8 +192,8 @@ class CalibrateAdopt:
     """The rig that it was driven with, for figures that a recording does not hold."""
     vehicle: _RecordedFile = None
     """The vehicle that it was driven with."""
-    out: ResultsFolder = Path("adopted")
-    headless: Headless = False
+    out: kinds.ResultsFolder = Path("adopted")
+    headless: kinds.Headless = False
 
 
 @dataclass(frozen=True)
@@ -234,14 +222,17 @@ class CalibrateConvert:
     """With --position-m: positive looks up."""
     roll_deg: _Angle = 0.0
     """With --position-m: positive is clockwise as seen from behind the camera."""
-    marker_size_m: Annotated[SizeM | None, optional("FLOAT", "(default: FIRST's, 0.1651)")] = None
+    marker_size_m: Annotated[
+        kinds.SizeM | None, optional("FLOAT", "(default: FIRST's, 0.1651)")
+    ] = None
     """Side of the black square of every tag in a WPILib layout, which does not tell."""
     family: Annotated[
         WPILibFamily | None, optional("{tag16h5,tag25h9,tag36h11}", "(default: FIRST's, tag36h11)")
     ] = None
     """Of the tags in a WPILib layout, which does not tell."""
     field_size_m: Annotated[
-        tuple[Positive, Positive] | None, optional("LENGTH WIDTH", "(default: what the map spans)")
+        tuple[kinds.Positive, kinds.Positive] | None,
+        optional("LENGTH WIDTH", "(default: what the map spans)"),
     ] = None
     """Of the field in a WPILib layout to be written."""
 
@@ -275,21 +266,21 @@ class CalibrateRig(_Seen):
     report.json; report.png; trajectory.tum.
     """
 
-    rig: OptionalFile = None
+    rig: kinds.OptionalFile = None
     """Cameras: their lenses, and about where they are, in place of the recording's own."""
-    markers: OptionalFile = None
+    markers: kinds.OptionalFile = None
     """Markers whose places are known, one at least: they tie the world down. By default those that
     a drive brings along; without any the world is the frame of the marker seen most."""
     marker_size_m: MarkerSize = None
     family: Family = None
-    refine_lenses: Switch = False
+    refine_lenses: kinds.Switch = False
     """Adjust focal lengths, centres and lenses as well, from where the rig has them."""
     vehicle_frame: Annotated[str, tyro.conf.arg(metavar="places|drive|CAMERA")] = "places"
     """What ties the vehicle frame down: the given places of all cameras together; a drive with
     straight lines and circles; or the given place of one camera."""
-    vehicle: QCarFile = None
+    vehicle: kinds.QCarFile = None
     """Vehicle file, whose wheelbase a drive needs."""
-    out: ResultsFolder = Path("calibrated")
+    out: kinds.ResultsFolder = Path("calibrated")
 
 
 @dataclass(frozen=True)
@@ -301,14 +292,14 @@ class CalibrateMarkers(_Seen):
     Written to --out: markers.yaml with sigmas; report.json; report.png; trajectory.tum.
     """
 
-    rig: OptionalFile = None
+    rig: kinds.OptionalFile = None
     """Cameras, in place of the recording's own."""
-    markers: OptionalFile = None
+    markers: kinds.OptionalFile = None
     """Markers whose places are known, one at least. By default those that a drive brings along;
     without any the world is the frame of the marker seen most."""
     marker_size_m: MarkerSize = None
     family: Family = None
-    out: ResultsFolder = Path("calibrated")
+    out: kinds.ResultsFolder = Path("calibrated")
 
 
 @dataclass(frozen=True)
@@ -322,16 +313,16 @@ class CalibrateCheck(_Seen):
     Written to --out: markers.yaml, the map as it was found; report.json; report.png.
     """
 
-    rig: OptionalFile = None
+    rig: kinds.OptionalFile = None
     """Cameras, in place of the recording's own."""
-    markers: OptionalFile = None
+    markers: kinds.OptionalFile = None
     """Map to be checked, in place of the one that a drive brings along."""
     family: Family = None
-    tolerance_m: Positive = 0.02
+    tolerance_m: kinds.Positive = 0.02
     """A marker that is no further off than this, and no more than its sigma explains, is right."""
-    tolerance_deg: Positive = 3.0
+    tolerance_deg: kinds.Positive = 3.0
     """The same for how it is turned."""
-    out: ResultsFolder = Path("checked")
+    out: kinds.ResultsFolder = Path("checked")
 
 
 @dataclass(frozen=True)
@@ -349,7 +340,7 @@ class CalibrateCompare:
     """Calibration: a rig file, a Kalibr camchain, or what convert reads."""
     other: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """Another one."""
-    out: ResultsFolder = Path("compared")
+    out: kinds.ResultsFolder = Path("compared")
 
 
 @dataclass(frozen=True)
@@ -373,16 +364,16 @@ class CalibrateOdometry:
     """Marker map."""
     vehicle: _RecordedFile = None
     """The vehicle as it stands: limits, wheelbase, and where the search starts."""
-    topics: OptionalFile = None
+    topics: kinds.OptionalFile = None
     """Which topic of a ROS bag is what."""
-    corner_backend: CornerBackend = "aruco"
+    corner_backend: kinds.CornerBackend = "aruco"
     """Who finds the markers in a ROS bag's images."""
     fix: Annotated[tuple[OdometryParameter, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """What is not looked for: it stays as it is in --vehicle."""
-    wheelbase_sigma_m: Annotated[SizeM | None, optional("M")] = None
+    wheelbase_sigma_m: Annotated[kinds.SizeM | None, optional("M")] = None
     """How well the wheelbase in --vehicle was measured; by default nothing is known of it."""
-    out: ResultsFolder = Path("calibrated")
-    headless: Headless = False
+    out: kinds.ResultsFolder = Path("calibrated")
+    headless: kinds.Headless = False
 
     def __post_init__(self) -> None:
         require(bool(self.recordings), "RECORDING", "names no recording")

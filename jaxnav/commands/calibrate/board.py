@@ -3,8 +3,6 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from jaxnav import __version__
 from jaxnav.calibrate.board.board import Board
 from jaxnav.calibrate.board.sheets import PAPERS_MM, check_fit, largest, sheet_of
@@ -29,14 +27,18 @@ _ADVICE = (
 def run(args: CalibrateBoard) -> int:
     """Write the board as PDF, PNG and YAML, and a report that says how to check the print."""
     configure_jax(float64=True)
-    paper_mm = _paper_mm(args)
+    width_mm, height_mm = args.paper_size_mm or PAPERS_MM[args.paper.lower()]
+    turned = args.landscape and width_mm <= height_mm
+    paper_mm = (height_mm, width_mm) if turned else (width_mm, height_mm)
     board = _board(args, paper_mm)
     folder = output_folder(args.out)
     words = str(board)
     figure = board_page(sheet_of(board), words, paper_mm)
-    _save(figure, folder / "board.pdf", "pdf", args.dpi)
-    _save(figure, folder / "board.png", "png", args.dpi)
-    write_board(folder / "board.yaml", board)
+    # Without a date the same board is the same file.
+    for form, metadata in (("pdf", {"CreationDate": None}), ("png", None)):
+        with atomic_path(folder / f"board.{form}") as beside:
+            figure.savefig(beside, dpi=args.dpi, format=form, metadata=metadata)
+    boards.save_board(folder / "board.yaml", vars(board))
     write_json(
         folder / "report.json",
         {
@@ -53,24 +55,15 @@ def run(args: CalibrateBoard) -> int:
     print(f"{words}, on {paper_mm[0]:g} x {paper_mm[1]:g} mm")
     print(f"{folder / 'board.pdf'}, {folder / 'board.png'}, {folder / 'board.yaml'}")
     print("\n".join(_ADVICE))
-    if board.kind == "marker":
-        family = "" if board.family == "tag36h11" else f" --family {board.family}"
-        print(
-            "Photograph it with a calibrated camera: jaxnav locate PHOTO --camera camera.yaml "
-            f"--marker-size-m {board.size_m:g}{family}, the side as measured where a ruler is off"
-        )
-    else:
-        print(
-            "Photograph it 20 times, tilted, into the corners of the image: "
-            f"jaxnav calibrate intrinsics FOLDER --board {folder / 'board.yaml'}"
-        )
+    family = "" if board.family == "tag36h11" else f" --family {board.family}"
+    print(
+        "Photograph it with a calibrated camera: jaxnav locate PHOTO --camera camera.yaml "
+        f"--marker-size-m {board.size_m:g}{family}, the side as measured where a ruler is off"
+        if board.kind == "marker"
+        else "Photograph it 20 times, tilted, into the corners of the image: "
+        f"jaxnav calibrate intrinsics FOLDER --board {folder / 'board.yaml'}"
+    )
     return 0
-
-
-def _paper_mm(args: CalibrateBoard) -> tuple[float, float]:
-    width_mm, height_mm = args.paper_size_mm or PAPERS_MM[args.paper.lower()]
-    lies = width_mm > height_mm
-    return (height_mm, width_mm) if args.landscape and not lies else (width_mm, height_mm)
 
 
 def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
@@ -79,11 +72,8 @@ def _board(args: CalibrateBoard, paper_mm: tuple[float, float]) -> Board:
     columns, rows = args.columns or across, args.rows or down
     family = _family(args, columns * rows // 2)
     # Without a given size, squares of 1 m, which are scaled below.
-    size_m = 1.0 if args.size_m is None else args.size_m
-    marker_m = 0.0
-    if args.marker_size_m is not None:
-        marker_m = args.marker_size_m
-    elif args.target == "charuco":
+    size_m, marker_m = args.size_m or 1.0, args.marker_size_m or 0.0
+    if args.target == "charuco" and args.marker_size_m is None:
         cells = len(marker_cells(family, 0))
         marker_m = size_m * cells / (cells + 2)
     try:
@@ -119,13 +109,6 @@ def _family(args: CalibrateBoard, charuco_markers: int) -> str:
     return next((f"4x4_{n}" for n in (50, 100, 250, 1000) if n >= needed), "4x4_1000")
 
 
-def _save(figure: Figure, path: Path, form: str, dpi: int) -> None:
-    # Without a date the same board is the same file.
-    metadata = {"CreationDate": None} if form == "pdf" else None
-    with atomic_path(path) as beside:
-        figure.savefig(beside, dpi=dpi, format=form, metadata=metadata)
-
-
 def read_board(path: Path) -> Board:
     """Read the board of a file.
 
@@ -137,12 +120,3 @@ def read_board(path: Path) -> Board:
         return Board(**entry.figures())
     except ValueError as error:
         raise BadInput(path, str(error)) from None
-
-
-def write_board(path: Path, board: Board) -> None:
-    """Write a board to a file that `read_board` reads.
-
-    Raises:
-        BadInput: the file can't be written.
-    """
-    boards.save_board(path, vars(board))

@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxnav.calibrate.lens.maps import ImageMap, projection_difference
 from jaxnav.commands.calibrate.arguments import CalibrateCompare
-from jaxnav.commands.calibrate.report import publish
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import publish
 from jaxnav.errors import BadInput
 from jaxnav.files import output_folder
 from jaxnav.files.cameras import camera_file

@@ -41,13 +41,8 @@ class _Source:
     left_out: tuple[str, ...]
 
 
-@dataclass
-class _Written:
-    """What is to be written, a word about each file, and what is not carried over."""
-
-    contents: dict[Path, str]
-    words: dict[Path, str]
-    left_out: list[str]
+# What is written into each file, a word about each, and what is not carried over.
+_Written = tuple[dict[Path, str], dict[Path, str], list[str]]
 
 
 def run(args: CalibrateConvert) -> int:
@@ -57,14 +52,15 @@ def run(args: CalibrateConvert) -> int:
     if source.format == args.to:
         raise BadInput(args.source, f"is {args.to}'s already: nothing to convert")
     written = _markers(args, source) if source.markers else _cameras(args, source)
-    refuse_overwriting("--out", written.contents, [args.source])
-    for folder in {path.parent for path in written.contents}:
+    contents, words, left_out = written
+    refuse_overwriting("--out", contents, [args.source])
+    for folder in {path.parent for path in contents}:
         output_folder(folder)
-    atomic_write_all(written.contents)
-    for path, what in written.words.items():
+    atomic_write_all(contents)
+    for path, what in words.items():
         print(f"{visible(path)}: {what}")
-    if written.left_out:
-        print(f"not carried over: {', '.join(written.left_out)}")
+    if left_out:
+        print(f"not carried over: {', '.join(left_out)}")
     return 0
 
 
@@ -115,7 +111,7 @@ def _markers(args: CalibrateConvert, source: _Source) -> _Written:
         left_out.append(f"family {one.family}")
         left_out.append(f"size_m {one.size_m!r} (--marker-size-m on the way back)")
     _require_suffix(args.to, args.out)
-    return _Written({args.out: text}, {args.out: words}, left_out)
+    return {args.out: text}, {args.out: words}, left_out
 
 
 def _cameras(args: CalibrateConvert, source: _Source) -> _Written:
@@ -128,14 +124,13 @@ def _cameras(args: CalibrateConvert, source: _Source) -> _Written:
         left_out.append(f"when the sensors of {', '.join(timed)} see (exposure_s, row_time_s)")
     if args.to in _MANY:
         _require_suffix(args.to, args.out)
-        return _Written({args.out: _MANY[args.to](cameras)}, {args.out: ", ".join(words)}, left_out)
+        return {args.out: _MANY[args.to](cameras)}, {args.out: ", ".join(words)}, left_out
     paths = _paths(args, cameras)
+    placed = [c.name for c in cameras if c.T_camera_vehicle is not None]
+    bare = [c.name for c in cameras if c.lens == "none"]
     for names, what in (
-        ([c.name for c in cameras if c.T_camera_vehicle is not None], "where on the vehicle {} {}"),
-        (
-            [c.name for c in cameras if c.lens == "none"],
-            "that {} {} without lens: written as zeros",
-        ),
+        (placed, "where on the vehicle {} {}"),
+        (bare, "that {} {} without lens: written as zeros"),
     ):
         if names:
             left_out.append(what.format(", ".join(names), "is" if len(names) == 1 else "are"))
@@ -143,8 +138,10 @@ def _cameras(args: CalibrateConvert, source: _Source) -> _Written:
     if renamed and args.to == "photonvision":
         left_out.append(f"the name{'s' if len(renamed) > 1 else ''} {', '.join(renamed)}")
     contents = [_ONE[args.to](camera) for camera in cameras]
-    return _Written(
-        dict(zip(paths, contents, strict=True)), dict(zip(paths, words, strict=True)), left_out
+    return (
+        dict(zip(paths, contents, strict=True)),
+        dict(zip(paths, words, strict=True)),
+        left_out,
     )
 
 

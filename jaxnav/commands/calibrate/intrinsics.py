@@ -13,19 +13,13 @@ from jaxnav.calibrate.lens.intrinsics import LensCalibration, calibrate_images
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
 from jaxnav.commands.calibrate.board import read_board
-from jaxnav.commands.calibrate.report import provenance, publish
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.report import provenance, publish
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
 from jaxnav.files import load_rig, output_folder
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import (
-    CameraEntry,
-    CameraSigma,
-    RigFile,
-    rig_data,
-    save_rig,
-)
+from jaxnav.files.rigs import CameraEntry, CameraSigma, RigFile, rig_data, save_rig
 from jaxnav.files.validation import validate
 from jaxnav.pictures.lens import lens_report
 
@@ -33,6 +27,10 @@ from jaxnav.pictures.lens import lens_report
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "rear": 180.0, "back": 180.0, "right": -90.0}
 
 _NAMED = 5  # views without the board that are named one by one
+_OTHER_PATTERN = (
+    "the board is printed in the pattern that its file does not say, `legacy: true` or `legacy: "
+    "false`: its points are the same"
+)
 
 
 def run(args: CalibrateIntrinsics) -> int:
@@ -62,20 +60,16 @@ def run(args: CalibrateIntrinsics) -> int:
 
     files = [args.board, *(file for one in collected.values() for file in one.files)]
     calibrated = provenance("intrinsics", files)
-    entries = {name: _entry(name, one, placed.get(name)) for name, one in calibrations.items()}
+    entries, cameras, advice, lines = {}, {}, list[str](), list[str]()
+    for name, one in calibrations.items():
+        entries[name] = _entry(name, one, placed.get(name))
+        cameras[name] = _report(one, collected[name])
+        advice += [f"{name}: {tip}" if len(calibrations) > 1 else tip for tip in one.advice]
+        lines += _lines(name, one, collected[name])
     rig = RigFile(cameras=list((placed | entries).values()))
     file = folder / "camera.yaml"
     save_rig(file, rig.rig(), calibrated, [entry.sigma or CameraSigma() for entry in rig.cameras])
-    advice = [
-        f"{name}: {sentence}" if len(calibrations) > 1 else sentence
-        for name, one in calibrations.items()
-        for sentence in one.advice
-    ]
-    cameras = {name: _report(one, collected[name]) for name, one in calibrations.items()}
     report = {"board": str(board), "cameras": cameras, "advice": advice}
-    lines = [
-        line for name, one in calibrations.items() for line in _lines(name, one, collected[name])
-    ]
     if not placed:
         lines.append(f"for a photo: jaxnav locate PHOTO --camera {file} --marker-size-m S")
         lines.append(f"for a car: write where its cameras are into {file}, or give --rig")
@@ -162,14 +156,8 @@ def _report(calibration: LensCalibration, collected: CollectedViews) -> dict[str
 
 
 def _notes(calibration: LensCalibration, collected: CollectedViews) -> tuple[str, ...]:
-    """What is to be known of the board and of the lens."""
-    if not collected.other_pattern:
-        return calibration.findings
-    other = (
-        "the board is printed in the pattern that its file does not say, `legacy: true` or "
-        "`legacy: false`: its points are the same"
-    )
-    return (other, *calibration.findings)
+    other = (_OTHER_PATTERN,) if collected.other_pattern else ()
+    return (*other, *calibration.findings)
 
 
 def _lines(name: str, calibration: LensCalibration, collected: CollectedViews) -> Iterator[str]:

@@ -51,11 +51,9 @@ def packages(distribution: str = "jaxnav") -> Iterator[Finding]:
             wrong.append(f"{required.name} is {version}, expected {required.specifier}")
     if wrong:
         yield found("packages.wrong", wrong=listed(wrong), distribution=distribution)
-    else:
-        version = metadata["Version"]
-        yield found(
-            "packages.fit", python=python, distribution=distribution, version=version, count=count
-        )
+        return
+    what = {"distribution": distribution, "version": metadata["Version"], "count": str(count)}
+    yield found("packages.fit", None, python=python, **what)
 
 
 def opencv() -> Iterator[Finding]:
@@ -83,7 +81,7 @@ def jax_device(model_file: Path = Path("/proc/device-tree/model")) -> Iterator[F
     """Check on which device the step will run, and that it can do so in float64.
 
     Args:
-        model_file: the file in which a single-board computer names its model.
+        model_file: in which a single-board computer names its model.
     """
     import jax
     import jax.numpy as jnp
@@ -117,12 +115,7 @@ def jax_cache() -> Iterator[Finding]:
 
 
 def compile_cache(folder: Path | None, refused: str | None = None) -> Iterator[Finding]:
-    """Check that compiled programs can be kept.
-
-    Args:
-        folder: JAX's cache; None where there is none.
-        refused: why a folder for the cache is not used.
-    """
+    """Check that compiled programs can be kept in a folder, or say why none is used."""
     if folder is None:
         yield found("compile cache.missing", why=refused or "there is no folder for it")
         return
@@ -168,11 +161,7 @@ def clock(
 
 
 def processor(folder: Path = Path("/sys/devices/system/cpu")) -> Iterator[Finding]:
-    """Check whether the kernel holds the processor's frequency down, as far as it tells.
-
-    Args:
-        folder: with the kernel's files, `cpu0/cpufreq/...`.
-    """
+    """Check whether the kernel holds the processor's frequency down, by `cpu0/cpufreq/...`."""
 
     def text(path: Path) -> str:
         try:
@@ -190,8 +179,8 @@ def processor(folder: Path = Path("/sys/devices/system/cpu")) -> Iterator[Findin
         allowed, most = text(core / "scaling_max_freq"), text(core / "cpuinfo_max_freq")
         if allowed.isdecimal() and most.isdecimal():
             share = min(share, float(allowed) / float(most))
-    key = "CPU.slow" if governors & _SLOW_GOVERNORS else "CPU.fast"
-    key = "CPU.held" if share < _MIN_CLOCK_SHARE else key
+    slow = "CPU.slow" if governors & _SLOW_GOVERNORS else "CPU.fast"
+    key = "CPU.held" if share < _MIN_CLOCK_SHARE else slow
     yield found(key, cores=len(cores), governors=listed(sorted(governors)), share=share)
 
 
@@ -205,7 +194,6 @@ def disk(
     Args:
         folder: where recordings go.
         usage: (total, used, free) bytes of a folder's disk.
-        monotonic_ns: the clock that times the writing.
     """
     free_mib = usage(folder)[2] / _MIB
     too_full = free_mib < 4 * _WRITTEN_MIB

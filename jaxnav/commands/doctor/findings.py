@@ -10,12 +10,11 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 from jaxnav.errors import BadInput
 
-Level = Literal["ok", "note", "warning", "error"]
-LEVELS: tuple[Level, ...] = ("error", "warning", "note", "ok")
+LEVELS = "error", "warning", "note", "ok"
 TEXTS: dict[str, dict[str, dict[str, str]]] = tomllib.loads(
     Path(__file__).with_name("findings.toml").read_text("utf-8")
 )
@@ -23,7 +22,6 @@ TEXTS: dict[str, dict[str, dict[str, str]]] = tomllib.loads(
 EXIT_ERROR_FOUND = 1
 EXIT_UNREADABLE = 2
 
-_SHOWN = {"ok": "ok", "note": "note", "warning": "WARNING", "error": "ERROR"}
 _NAME_WIDTH = 13  # of the longest name, "compile cache"
 
 
@@ -40,14 +38,15 @@ class Finding:
     """
 
     name: str
-    level: Level
+    level: str
     what: str
     do: str = ""
     key: str = ""
 
     def __str__(self) -> str:
         """One line, in columns that are the same for all findings, and `do` indented below."""
-        line = f"{_SHOWN[self.level]:<7}  {self.name:<{_NAME_WIDTH}}  {_one_line(self.what)}"
+        shown = self.level.upper() if self.level in ("error", "warning") else self.level
+        line = f"{shown:<7}  {self.name:<{_NAME_WIDTH}}  {_one_line(self.what)}"
         return f"{line}\n{'':9}do: {_one_line(self.do)}" if self.do else line
 
 
@@ -61,27 +60,26 @@ def found(key: str, at_level: str | None = None, **figures: Any) -> Finding:
     entry = TEXTS[name][short]
     level = next(level for level in LEVELS if level in entry)
     what, do = entry[level].format_map(figures), entry.get("do", "").format_map(figures)
-    shown = cast(Level, at_level or level)
+    shown = at_level or level
     return Finding(name, shown, what, "" if shown == "ok" else do, key)
 
 
 @dataclass
 class Report:
-    """All findings so far. A check that raises becomes a finding too, and hides no other.
+    """All findings so far, each printed as soon as it is known. A check that raises becomes a
+    finding too, and hides no other.
 
     Attributes:
-        show: called with each finding as soon as it is known.
         unreadable: whether a file or a flag could not be understood.
     """
 
-    show: Callable[[Finding], None]
     findings: list[Finding] = field(default_factory=list)
     unreadable: bool = False
 
     def add(self, finding: Finding) -> None:
-        """Append a finding and show it."""
+        """Append a finding and print it."""
         self.findings.append(finding)
-        self.show(finding)
+        print(finding, flush=True)
 
     def examine(self, name: str, check: Callable[[], Iterable[Finding]]) -> None:
         """Run a check, and keep what it found before it failed, as it may in any way.

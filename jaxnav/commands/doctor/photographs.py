@@ -2,13 +2,13 @@
 
 Each marker alone tells whether its corners are in the print's order, and whether the car is then
 level: the print is taken as true and the map is tested, its corners tried in every order in which a
-person may have written them down. All markers at once tell whether sizes, places, lenses and
-cameras agree, and which single error of the files explains it where they don't.
+person may have written them down. All markers at once tell whether the files agree; which of them
+is wrong a drive tells `jaxnav calibrate check`.
 """
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,11 @@ from typing import Any
 import jax
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Float, UInt8
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibrate.rig.views import Ts_vehicle_camera, both_poses, inverted, turn_rad
+from jaxnav.calibrate.rig.views import both_poses, inverted
 from jaxnav.commands.doctor.findings import Finding, found, listed
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
@@ -52,33 +52,29 @@ _CLEARLY = 2.0  # sigma
 # tape's errors in the cameras' places.
 ANYWHERE = (10.0, 10.0, 10.0, 3.0, 3.0, 3.0)
 LEVEL = (10.0, 10.0, 0.01, np.deg2rad(0.5), np.deg2rad(0.5), 3.0)
-_SCALE_SIGMA = 0.3  # of the logarithm of a true over a written size or focal length
-_ASIDE, _TURNS_DEG = 0.2, 10.0  # the most of its shift that a wrong size explains
-_MOST_WAYS = 3  # that explain a contradiction and are named
+_SCALE_SIGMA = 0.3  # of the logarithm of a true over a written size
 _MOST_STARTS = 4  # of many markers, whose poses a search begins at
 
 
-def pictures(
-    frames: Mapping[str, str],
-    rig: CameraRig | None,
-    markers: MarkerMap | None,
-    route: Route | None,
-) -> Iterator[Finding]:
+def pictures(frames: Mapping[str, str], files: Mapping[str, Any]) -> Iterator[Finding]:
     """Read pictures of one standing car, by the names of their cameras, and examine them.
+
+    Args:
+        files: rig, markers and route, as far as they could be read.
 
     Raises:
         BadInput: a picture can't be read, or is of a camera that the rig does not have.
     """
-    if rig is None or markers is None:
+    if "rig" not in files or "markers" not in files:
         yield found("picture.skipped")
         return
-    images = {}
+    rig, images = files["rig"], {}
     for name, path in frames.items():
         if name not in rig.names:
             problem = f"the rig has no camera {name!r}: expected one of {', '.join(rig.names)}"
             raise BadInput(f"--frame {name}={path}", problem)
         images[name] = read_image(Path(path))
-    yield from examine_pictures(rig, markers, route, images)
+    yield from examine_pictures(rig, files["markers"], files.get("route"), images)
 
 
 def examine_pictures(
@@ -92,8 +88,14 @@ def examine_pictures(
     Args:
         images: by the names of their cameras.
     """
-    wrong = list(_other_sizes(rig, images))
-    yield from wrong
+    sizes_px = dict(zip(rig.names, rig.image_sizes_px, strict=True))
+    wrong = [name for name, image in images.items() if image.shape[1::-1] != sizes_px[name]]
+    for name in wrong:
+        (height, width), (rig_width, rig_height) = images[name].shape[:2], sizes_px[name]
+        yield found(
+            "picture.size", camera=name, width=width, height=height, rig_width=rig_width,
+            rig_height=rig_height,
+        )  # fmt: skip
     if wrong:
         return
     detectors = make_detectors(markers)
@@ -112,18 +114,6 @@ def examine_pictures(
     seen, poses, findings = in_their_order(seen, route)
     yield from findings
     yield from _together(seen, poses, route)
-
-
-def _other_sizes(rig: CameraRig, images: Mapping[str, np.ndarray]) -> Iterator[Finding]:
-    """Report pictures of another size than their camera was calibrated at."""
-    for name, image in images.items():
-        size_px = rig.image_sizes_px[rig.names.index(name)]
-        if image.shape[1::-1] != size_px:
-            height, width = image.shape[:2]
-            yield found(
-                "picture.size", camera=name, width=width, height=height,
-                rig_width=size_px[0], rig_height=size_px[1],
-            )  # fmt: skip
 
 
 def _identities(
@@ -161,13 +151,10 @@ class Sighted:
     markers: MarkerMap
     lanes: CornerLanes
 
-    def where(self, mask: Bool[np.ndarray, "C M"] | np.ndarray) -> "Sighted":
-        """These sightings with only some of them in view."""
-        return replace(self, lanes=self.lanes._replace(visible=self.lanes.visible & mask))
-
     def only(self, marker: int) -> "Sighted":
         """These sightings with only one marker in view."""
-        return self.where(np.arange(len(self.markers.ids)) == marker)
+        alone = np.arange(len(self.markers.ids)) == marker
+        return replace(self, lanes=self.lanes._replace(visible=self.lanes.visible & alone))
 
     def reordered(self, marker: int, order: tuple[int, ...]) -> "Sighted":
         """These sightings with the corners of one marker in another order."""
@@ -221,18 +208,6 @@ def _projected_px(
     return rig.project(T_vehicle_world, markers.corners_world_m)
 
 
-# Rig and markers, of which something is a factor larger.
-Scaled = Callable[[CameraRig, MarkerMap, float], tuple[CameraRig, MarkerMap]]
-
-
-def _larger(rig: CameraRig, markers: MarkerMap, factor: float) -> tuple[CameraRig, MarkerMap]:
-    return rig, replace(markers, size_m=markers.size_m * factor)
-
-
-def _longer(rig: CameraRig, markers: MarkerMap, factor: float) -> tuple[CameraRig, MarkerMap]:
-    return rig.with_focal_px(float(np.mean(rig.cameras.focal_px)) * factor), markers
-
-
 @dataclass(frozen=True)
 class Fit:
     """The pose that explains the corners best.
@@ -240,7 +215,7 @@ class Fit:
     Attributes:
         cost: chi-square of corners and prior.
         error_px: RMS error of all corner coordinates.
-        factor: of what is scaled, where something is.
+        factor: of all sizes, where these are fitted.
         covariance: of a shift and a turn of the vehicle in its own frame, and of the logarithm of
             the factor where there is one.
     """
@@ -263,17 +238,13 @@ class Fit:
         return float(np.rad2deg(np.arccos(np.clip(self.T_world_vehicle[2, 2], -1, 1))))
 
 
-def fit(
-    seen: Sighted,
-    start: Float[np.ndarray, "4 4"],
-    sigmas: Sequence[float],
-    scaled: Scaled | None = None,
-) -> Fit:
-    """The best pose near a start, and the best factor of what may be scaled.
+def fit(seen: Sighted, start: Float[np.ndarray, "4 4"], sigmas: Sequence[float]) -> Fit:
+    """The best pose near a start.
 
     Args:
         start: T_world_vehicle, which the prior is about.
-        sigmas: of the prior: six of the pose, and one of the factor's logarithm.
+        sigmas: of the prior: six of the pose and, where one factor of all sizes is to be fitted,
+            one of its logarithm.
     """
     visible, sigma_px = seen.lanes.visible, seen.sigma_px[..., None]
 
@@ -281,10 +252,11 @@ def fit(
         """The pose, the factor, and the errors in px."""
         xi = u * sigmas
         T = start @ transform(Rotation.from_rotvec(xi[3:6]).as_matrix(), xi[:3])
-        files, factor = (seen.rig, seen.markers), math.exp(float(xi[6:].sum()))
-        if scaled:
-            files = scaled(*files, factor)
-        return T, factor, (np.asarray(_projected_px(*files, T)) - seen.lanes.corners_px)[visible]
+        factor, markers = math.exp(float(xi[6:].sum())), seen.markers
+        if len(sigmas) > 6:
+            markers = replace(markers, size_m=markers.size_m * factor)
+        errors_px = np.asarray(_projected_px(seen.rig, markers, T)) - seen.lanes.corners_px
+        return T, factor, errors_px[visible]
 
     def residuals(u: np.ndarray) -> np.ndarray:
         return np.append(at(u)[2] / sigma_px, u)
@@ -323,14 +295,8 @@ def in_their_order(seen: Sighted, route: Route | None) -> tuple[Sighted, list[Fi
         alone = seen.only(index)
         allowed_px = alone.allowed_px * math.sqrt((alone.numbers - 6) / alone.numbers)
         if pose.error_px > _MAX_ERROR * allowed_px:  # they fit no square at all
-            findings.append(
-                found(
-                    "picture.no_square",
-                    marker=marker,
-                    error_px=pose.error_px,
-                    allowed_px=allowed_px,
-                )
-            )
+            off: dict[str, Any] = {"error_px": pose.error_px, "allowed_px": allowed_px}
+            findings.append(found("picture.no_square", marker=marker, **off))
     return seen, poses, findings
 
 
@@ -398,13 +364,13 @@ def _levelled(marker: str, pose: Fit) -> Finding:
 
 
 def _together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Iterator[Finding]:
-    """Report where the car stands, and which part of the files contradicts the rest.
+    """Report where the car stands, and whether all markers agree or the only one has its size.
 
     Args:
         seen: corners in the order of the print.
         poses: the pose by each marker alone.
     """
-    whole = _on_ground(seen, poses)
+    whole = _on_ground(seen, poses, LEVEL)
     x_m, y_m, psi_rad = whole.planar
     if route is not None:
         start = route.start_pose
@@ -418,92 +384,28 @@ def _together(seen: Sighted, poses: Sequence[Fit], route: Route | None) -> Itera
             turn_deg=round(math.degrees(apart_rad)),
         )
     if len(seen.ids) == 1:
-        yield _size(seen, poses[0])
+        yield _size(seen, poses)
         return
-    count, allowed_px = len(seen.ids), seen.allowed_px
-    agree = found("picture.agree", count=count, error_px=whole.error_px, allowed_px=allowed_px)
-    if _fits(seen, whole):
-        yield agree
-        return
-    ways = list(_contradictions(seen, poses))[:_MOST_WAYS]
-    if not ways:
-        yield found("picture.unexplained", together=agree.what)
-        return
-    either = " or ".join(finding.what for finding in ways)
-    yield replace(ways[0], what=f"{agree.what}; all agree if {either}")
+    fits = whole.cost <= _FITS * seen.numbers or whole.error_px < _SMALL_PX
+    key, count = "picture.agree" if fits else "picture.disagree", len(seen.ids)
+    yield found(key, count=count, error_px=whole.error_px, allowed_px=seen.allowed_px)
 
 
-def _on_ground(seen: Sighted, starts: Sequence[Fit], scaled: Scaled | None = None) -> Fit:
+def _on_ground(seen: Sighted, starts: Sequence[Fit], sigmas: Sequence[float]) -> Fit:
     """The best level pose."""
-    fits, sigmas = [], (*LEVEL, _SCALE_SIGMA) if scaled else LEVEL
+    fits = []
     for x_m, y_m, psi_rad in (start.planar for start in starts[:_MOST_STARTS]):
         R = Rotation.from_euler("z", psi_rad).as_matrix()
-        fits.append(fit(seen, transform(R, np.array([x_m, y_m, 0.0])), sigmas, scaled))
+        fits.append(fit(seen, transform(R, np.array([x_m, y_m, 0.0])), sigmas))
     return min(fits, key=lambda each: each.cost)
 
 
-def _fits(seen: Sighted, pose: Fit) -> bool:
-    return pose.cost <= _FITS * seen.numbers or pose.error_px < _SMALL_PX
-
-
-def _contradictions(seen: Sighted, poses: Sequence[Fit]) -> Iterator[Finding]:
-    """What explains that the markers don't agree: all of them or the lenses are scaled; or the
-    others agree without one marker or camera, which is then so far off. As in `jaxnav calibrate
-    check`, what most agree about is taken as right."""
-    for key, scaled in (("picture.sizes", _larger), ("picture.focal", _longer)):
-        whole = _on_ground(seen, poses, scaled)
-        if _fits(seen, whole):
-            yield found(key, factor=whole.factor)
-    C, M = seen.lanes.visible.shape
-    for index, alone in zip(seen.ids, poses, strict=True):
-        others = seen.where(np.arange(M) != index)
-        rest = _on_ground(others, poses)
-        if not _fits(others, rest):
-            continue
-        T_map = np.asarray(seen.markers.Ts_world_marker.as_matrix(), float)[index]
-        T_found = rest.T_world_vehicle @ inverted(alone.T_world_vehicle) @ T_map
-        shift_m, turn_deg = T_found[:3, 3] - T_map[:3, 3], np.rad2deg(turn_rad(T_found, T_map))
-        camera = int(np.flatnonzero(seen.lanes.visible[:, index])[0])
-        eye_m = (rest.T_world_vehicle @ Ts_vehicle_camera(seen.rig)[camera])[:3, 3]
-        # Of another size, a marker seems to be nearer or farther in the same direction.
-        way_m, found_m = T_map[:3, 3] - eye_m, T_found[:3, 3] - eye_m
-        aside_m = np.linalg.norm(np.cross(way_m, found_m)) / np.linalg.norm(way_m)
-        if aside_m < _ASIDE * np.linalg.norm(shift_m) and turn_deg < _TURNS_DEG:
-            factor = float(np.linalg.norm(way_m) / np.linalg.norm(found_m))
-            yield found("picture.one_size", **_size_figures(seen, index, factor))
-        else:
-            apart_m = np.linalg.norm(shift_m)
-            yield found("picture.moved", marker=seen.ids[index], shift_m=apart_m, turn_deg=turn_deg)
-    used = np.flatnonzero(seen.lanes.visible.any(axis=1)).tolist()
-    for camera in used if len(used) > 1 else ():
-        mine = (np.arange(C) == camera)[:, None]
-        others, own = seen.where(~mine), seen.where(mine)
-        rest, alone = _on_ground(others, poses), standing(own)
-        eyes_m = [
-            (pose.T_world_vehicle @ Ts_vehicle_camera(seen.rig)[camera])[:3, 3]
-            for pose in (rest, alone)
-        ]
-        # One that is turned still knows where it is.
-        turned = np.linalg.norm(eyes_m[0] - eyes_m[1]) < _MOST_HEIGHT_M
-        if turned and _fits(others, rest) and _fits(own, alone):
-            turn_deg = np.rad2deg(turn_rad(alone.T_world_vehicle, rest.T_world_vehicle))
-            yield found("picture.camera", camera=seen.rig.names[camera], turn_deg=turn_deg)
-
-
-def _size(seen: Sighted, alone: Fit) -> Finding:
+def _size(seen: Sighted, alone: Sequence[Fit]) -> Finding:
     """Check the size of a single marker: its height over the camera tells its distance, so size."""
-    (index,), by = seen.ids, _on_ground(seen, [alone], _larger)
-    sigma = math.sqrt(by.covariance[6, 6])
+    ((index, marker),) = seen.ids.items()
+    by = _on_ground(seen, alone, (*LEVEL, _SCALE_SIGMA))
+    sigma, map_m = math.sqrt(by.covariance[6, 6]), float(seen.markers.size_m[index])
     wrong = abs(math.log(by.factor)) > max(_CLEARLY * sigma, _LEAST_SIZE)
     key = "picture.own_size" if wrong else "picture.right_size"
-    return found(key, sigma=sigma, **_size_figures(seen, index, by.factor))
-
-
-def _size_figures(seen: Sighted, marker: int, factor: float) -> dict[str, Any]:
-    map_m = float(seen.markers.size_m[marker])
-    return {
-        "marker": seen.ids[marker],
-        "factor": factor,
-        "map_m": map_m,
-        "size_m": map_m * factor,
-    }
+    size_m = map_m * by.factor
+    return found(key, marker=marker, factor=by.factor, sigma=sigma, map_m=map_m, size_m=size_m)

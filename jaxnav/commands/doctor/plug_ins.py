@@ -1,66 +1,63 @@
-"""Checks that open the vehicle and its cameras, read them for a moment, and never drive."""
+"""Checks of a vehicle and its cameras, which are opened and read for a moment and never driven; and
+of a recorded drive, whether the cameras' stamps tell when the images were taken."""
 
 import math
 import time
+import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from jaxnav.commands.doctor.cameras import judge_cameras, watch
-from jaxnav.commands.doctor.findings import Finding, Report, found, said
-from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.rig import CameraRig
-from jaxnav.core.models.vehicle import TwistBase, Vehicle
+import numpy as np
+
+from jaxnav.commands.doctor.findings import Finding, Report, found, listed, said
+from jaxnav.commands.drive.arguments import Doctor
+from jaxnav.commands.drive.observers import delay_warnings, delays_of, describe_delay
+from jaxnav.commands.kinds import key_values
 from jaxnav.drive import plugins
+from jaxnav.drive.camera_delays import HARMLESS_S
 from jaxnav.drive.chassis import Chassis, chassis_of, pace_mps
-from jaxnav.drive.interfaces import AnyVehicle, Odometry, Setup
+from jaxnav.drive.interfaces import AnyVehicle, Camera, Frame, Odometry, Setup
 from jaxnav.drive.interfaces import Reading as Read
 from jaxnav.drive.limits import Limits
 from jaxnav.drive.moved_vehicle import GuardProcess
 from jaxnav.errors import BadInput
-from jaxnav.files import Route
+from jaxnav.recordings.drive_log import read_drive
+from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.vehicles.conformance.calls import HANGS_S, Worker, start_call
 from jaxnav.vehicles.conformance.cameras import Parked
 
+OPENS_WITHIN_S = 30.0
+PATIENCE_S = 3.0  # until a driver must have measured something, or a first picture must have come
+
 READINGS = 20
-PATIENCE_S = 3.0  # until a driver must have measured something
 SLOW_S = 0.02  # a whole tick of the loop
 OLD_S = 0.1  # the loop calls older odometry stale
 LEAST_RATE_HZ = 20.0
-OPENS_WITHIN_S = 30.0
 _PAUSE_S = 0.01
 _STANDS_MPS = 0.05
 
+WATCH_S = 1.0
+OLD_FRAME_S = 0.2  # the loop calls a camera with older frames stale
+LATE_FRAME_S = 0.1
+LEAST_FRAME_RATE_HZ = 10.0
+SKEW_S = 0.02
+_DARK, _BRIGHT = 15.0, 240.0  # mean grey levels
+_LEAST_CONTRAST = 8.0  # standard deviation of grey levels
+_FROZEN = 3  # pictures that are all identical
 
-@dataclass(frozen=True)
-class Reading:
-    """One `read` of a vehicle: its odometry, when it returned, and how long it took."""
 
-    odometry: Read
-    now_ns: int
-    took_s: float
-
-
-def plug_ins(
-    report: Report,
-    asked: tuple[str | None, str | None, dict[str, str]],
-    rig: CameraRig | None,
-    markers: MarkerMap | None,
-    vehicle: Vehicle | TwistBase | None,
-    route: Route | None,
-) -> Iterator[Finding]:
-    """Examine the plug-ins that were named, if all files can be read.
-
-    Args:
-        asked: the names of vehicle and cameras, and the options.
-    """
-    if rig is None or markers is None or vehicle is None or route is None:
+def plug_ins(args: Doctor, report: Report, files: dict[str, Any]) -> Iterator[Finding]:
+    """Examine the plug-ins that were named, if all files could be read."""
+    if len(files) < 4:
         yield found("plug-ins.skipped")
         return
-    vehicle_name, cameras_name, options = asked
-    setup = Setup(rig, markers, vehicle, route.start_pose, options=options)
-    examine(report, setup, vehicle_name, cameras_name)
+    rig, markers, vehicle = files["rig"], files["markers"], files["vehicle"]
+    options, start = key_values("--option", args.option), files["route"].start_pose
+    setup = Setup(rig, markers, vehicle, start, options=options)
+    examine(report, setup, args.car, args.cameras)
 
 
 def examine(
@@ -131,19 +128,16 @@ def _close(name: str, things: Sequence[Any]) -> Iterator[Finding]:
             yield found(f"{name}.unclosed", why=said(failure))
 
 
-def _cameras(name: str, setup: Setup, vehicle: AnyVehicle) -> Iterator[Finding]:
-    plugins.load_factory("--cameras", plugins.CAMERAS, name)
-    try:
-        cameras = _open("opening them", plugins.open_cameras, name, setup, vehicle)
-    except ValueError as failure:
-        yield found("cameras.unopened", why=failure)
-        return
-    try:
-        watched = watch(cameras)
-    finally:
-        closing = list(_close("cameras", cameras))
-    yield from judge_cameras(watched, setup.rig.image_sizes_px)
-    yield from closing
+# --- odometry ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One `read` of a vehicle: its odometry, when it returned, and how long it took."""
+
+    odometry: Read
+    now_ns: int
+    took_s: float
 
 
 def _odometry(vehicle: AnyVehicle, chassis: Chassis) -> Iterator[Finding]:
@@ -205,9 +199,6 @@ def _in_words(read: Read) -> str:
 def _wrong_stamps(
     readings: Sequence[Reading], ages_s: Sequence[float], rate_hz: float
 ) -> Iterator[Finding]:
-    """Args:
-    rate_hz: of distinct stamps.
-    """
     slow, count = sum(reading.took_s > SLOW_S for reading in readings), len(readings)
     if min(ages_s) < 0:
         yield found("odometry.future", age_s=-min(ages_s))
@@ -246,3 +237,169 @@ def _wrong_values(readings: Sequence[Reading], chassis: Chassis) -> Iterator[Fin
         if abs(widest_rad) > 1.1 * limits.steering_rad:
             limit_rad = limits.steering_rad
             yield found("odometry.steering", steering_rad=widest_rad, limit_rad=limit_rad)
+
+
+# --- cameras -------------------------------------------------------------------------------
+
+
+@dataclass
+class Watched:
+    """What one camera gave within a second.
+
+    Attributes:
+        stamps_ns: of its frames.
+        ages_s: the age of each frame when `read` returned it.
+        pictures: a checksum of each image.
+        first: the first frame.
+        failure: the last error of `read`, or that it hung; empty without one.
+    """
+
+    name: str
+    stamps_ns: list[int] = field(default_factory=list)
+    ages_s: list[float] = field(default_factory=list)
+    pictures: list[int] = field(default_factory=list)
+    first: Frame | None = None
+    failure: str = ""
+
+    @property
+    def rate_hz(self) -> float:
+        """The mean rate of the stamps, Hz; 0 where they span no time."""
+        span_s = (max(self.stamps_ns) - min(self.stamps_ns)) / 1e9
+        return (len(self.stamps_ns) - 1) / span_s if span_s > 0 else 0.0
+
+
+def watch(cameras: Sequence[Camera]) -> list[Watched]:
+    """Read all cameras at once, each in its own thread, for a second after its first picture."""
+    watched = [Watched(camera.name) for camera in cameras]
+    looks = [
+        start_call(partial(_look, camera, into))
+        for camera, into in zip(cameras, watched, strict=True)
+    ]
+    for look, into in zip(looks, watched, strict=True):
+        try:
+            look("read()", PATIENCE_S + 2 * WATCH_S)
+        except (AssertionError, OSError) as failure:
+            into.failure = str(failure)
+    return watched
+
+
+def _look(camera: Camera, into: Watched) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < until_s:
+        try:
+            frame = camera.read(0.2)
+        except OSError as failure:
+            into.failure = said(failure)
+            time.sleep(0.05)
+            continue
+        if frame is None:
+            continue
+        if into.first is None:
+            into.first = frame
+            until_s = time.monotonic() + WATCH_S
+        into.stamps_ns.append(frame.stamp_ns)
+        into.ages_s.append((time.monotonic_ns() - frame.stamp_ns) / 1e9)
+        if frame.image is not None:
+            into.pictures.append(zlib.crc32(np.asarray(frame.image).tobytes()))
+
+
+def _cameras(name: str, setup: Setup, vehicle: AnyVehicle) -> Iterator[Finding]:
+    plugins.load_factory("--cameras", plugins.CAMERAS, name)
+    try:
+        cameras = _open("opening them", plugins.open_cameras, name, setup, vehicle)
+    except ValueError as failure:
+        yield found("cameras.unopened", why=failure)
+        return
+    try:
+        watched = watch(cameras)
+    finally:
+        closing = list(_close("cameras", cameras))
+    yield from judge_cameras(watched, setup.rig.image_sizes_px)
+    yield from closing
+
+
+def judge_cameras(
+    watched: Sequence[Watched], sizes_px: Sequence[tuple[int, int]]
+) -> Iterator[Finding]:
+    """Report what is wrong with each camera, and the skew between all of them.
+
+    Args:
+        sizes_px: (width, height) of the rig's images.
+    """
+    for camera, size_px in zip(watched, sizes_px, strict=True):
+        name, first, ages_s = camera.name, camera.first, camera.ages_s
+        if first is None:
+            why = f": {camera.failure}" if camera.failure else ""
+            yield found("cameras.silent", camera=name, patience_s=PATIENCE_S, why=why)
+            continue
+        findings, light = list[Finding](), ", finds markers by itself"
+        if first.image is not None:
+            image = np.asarray(first.image)
+            light = f", mean grey {image.mean():.0f}, contrast {image.std():.0f}"
+            findings += _wrong_picture(name, image, size_px)
+        rate_hz, age_s = camera.rate_hz, float(np.median(ages_s))
+        if camera.failure:
+            findings.append(found("cameras.failed", camera=name, why=camera.failure))
+        if min(ages_s) < 0:
+            findings.append(found("cameras.future", camera=name, age_s=-min(ages_s)))
+        elif age_s > LATE_FRAME_S:
+            level = "error" if age_s > OLD_FRAME_S else None
+            findings.append(found("cameras.old", level, camera=name, age_s=age_s))
+        if rate_hz < LEAST_FRAME_RATE_HZ:
+            findings.append(found("cameras.rare", camera=name, rate_hz=rate_hz))
+        if len(camera.pictures) >= _FROZEN and len(set(camera.pictures)) == 1:
+            findings.append(found("cameras.frozen", camera=name, count=len(camera.pictures)))
+        fine = found("cameras.fine", camera=name, rate_hz=rate_hz, age_ms=age_s * 1e3, light=light)
+        yield from findings or [fine]
+    yield from skew(watched)
+
+
+def _wrong_picture(name: str, image: np.ndarray, size_px: tuple[int, int]) -> Iterator[Finding]:
+    if image.dtype != np.uint8 or image.ndim not in (2, 3):
+        yield found("cameras.kind", camera=name, dtype=image.dtype, shape=image.shape)
+        return
+    height, width = image.shape[:2]
+    if (width, height) != tuple(size_px):
+        yield found(
+            "cameras.size", camera=name, width=width, height=height, rig_width=size_px[0],
+            rig_height=size_px[1],
+        )  # fmt: skip
+    mean, contrast = float(image.mean()), float(image.std())
+    if not _DARK <= mean <= _BRIGHT or contrast < _LEAST_CONTRAST:
+        yield found("cameras.light", camera=name, mean=mean, contrast=contrast)
+
+
+def skew(watched: Sequence[Watched]) -> Iterator[Finding]:
+    """Report the time between each camera's frames and the nearest ones of the first camera."""
+    seen = [camera for camera in watched if len(camera.stamps_ns) > 1]
+    if len(seen) < 2:
+        return
+    apart_s = {}
+    for camera in seen[1:]:
+        apart_ns = np.subtract.outer(camera.stamps_ns, seen[0].stamps_ns)
+        nearest = np.abs(apart_ns).argmin(axis=1, keepdims=True)
+        apart_s[camera.name] = float(np.median(np.take_along_axis(apart_ns, nearest, 1))) / 1e9
+    shown = listed(f"{name} {value * 1e3:+.0f} ms" for name, value in apart_s.items())
+    key = "cameras.apart" if max(map(abs, apart_s.values())) > SKEW_S else "cameras.together"
+    yield found(key, apart=f"against {seen[0].name}: {shown}")
+
+
+def stamps(path: Path) -> Iterator[Finding]:
+    """Report each camera's delay against the odometer in a drive that `jaxnav run --record` wrote.
+
+    Raises:
+        BadInput: the file is no recording, or damaged, or not of a car.
+    """
+    log = read_drive(path)
+    setup = DriveSetup.from_header(log.header, path)
+    setup.car(path)
+    delays = delays_of(log, setup)
+    for text in delay_warnings(delays, setup):
+        what, _, do = text.partition(": ")
+        yield found("stamps.late", what=what, do=do)
+    for name, one in zip(setup.rig.names, delays.delays, strict=True):
+        if not one.known:
+            yield found("stamps.unknown", camera=name, file=path.name)
+        elif not one.late:
+            delay, harmless_ms = describe_delay(one), HARMLESS_S * 1e3
+            yield found("stamps.fine", camera=name, delay=delay, harmless_ms=harmless_ms)

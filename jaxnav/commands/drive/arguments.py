@@ -1,4 +1,4 @@
-"""Arguments of the commands that drive a car, or read a recording or a photograph."""
+"""Arguments of the commands that drive a car or check it, or read a recording or a photograph."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,31 +7,8 @@ from typing import Annotated
 import tyro
 from annotated_types import Gt, Interval
 
-from jaxnav.commands.kinds import (
-    Believed,
-    CornerBackend,
-    CornerSigma,
-    Count,
-    Detector,
-    Float64,
-    Following,
-    Headless,
-    KeyValues,
-    OptionalFile,
-    OptionalName,
-    Positive,
-    QCarFile,
-    QCarMarkers,
-    QCarRig,
-    QCarVehicle,
-    ResultsFolder,
-    Seed,
-    Selector,
-    SizeM,
-    Switch,
-    optional,
-    require,
-)
+from jaxnav.commands import kinds
+from jaxnav.commands.kinds import key_values, optional, require
 
 # What a loop can keep.
 _Period = Annotated[
@@ -70,37 +47,37 @@ class Run:
     """An installed vehicle (sim, qcar, ros2, replay and those of plug-ins), or MODULE:NAME."""
     cameras: Annotated[str | None, optional("NAME", "(default: as --car)", str)] = None
     """Installed cameras (sim, qcar, opencv, replay and those of plug-ins), or MODULE:NAME."""
-    option: KeyValues = ()
+    option: kinds.KeyValues = ()
     """What the vehicle and the cameras are told, e.g. images=true for sim."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarVehicle = None
-    route: QCarFile = None
+    rig: kinds.QCarRig = None
+    markers: kinds.QCarMarkers = None
+    vehicle: kinds.QCarVehicle = None
+    route: kinds.QCarFile = None
     """Waypoints, and where a simulated car starts."""
-    params: OptionalFile = None
+    params: kinds.OptionalFile = None
     """Tuned parameters of filter and controller."""
-    selector: Believed = "multi-hypothesis"
-    corner_backend: Detector = "aruco"
-    detector: Following = "follow"
+    selector: kinds.Believed = "multi-hypothesis"
+    corner_backend: kinds.Detector = "aruco"
+    detector: kinds.Following = "follow"
     relocate: bool = True
     """Drive on, slowly at first, where the corners say that the car is where its wheels can't have
     brought it: somebody carried it there, or shows it a copy of the marker. Without: stop."""
     record: Annotated[Path | None, optional("MCAP")] = None
     """Record the drive into this file."""
-    record_images: Switch = False
+    record_images: kinds.Switch = False
     """Record the cameras' images too, as JPEG."""
-    view: Switch = False
+    view: kinds.Switch = False
     """Open Rerun and look on. Needs the extra viz."""
-    duration_s: Annotated[Positive | None, optional("S", "(default: until the last waypoint)")] = (
-        None
-    )
+    duration_s: Annotated[
+        kinds.Positive | None, optional("S", "(default: until the last waypoint)")
+    ] = None
     """End after this time, s."""
     period_s: _Period = 0.02
     timeout_s: _Timeout = 0.2
-    float64: Float64 = False
-    seed: Seed = 0
+    float64: kinds.Float64 = False
+    seed: kinds.Seed = 0
     """Of a simulated vehicle."""
-    headless: Switch = False
+    headless: kinds.Switch = False
     """No status line."""
 
     def __post_init__(self) -> None:
@@ -120,9 +97,9 @@ class Stop:
 
     car: str
     """As `jaxnav run` was told: an installed vehicle, or MODULE:NAME."""
-    option: KeyValues = ()
+    option: kinds.KeyValues = ()
     """What the vehicle is told, as by `jaxnav run`."""
-    vehicle: QCarVehicle = None
+    vehicle: kinds.QCarVehicle = None
 
 
 @dataclass(frozen=True)
@@ -139,20 +116,20 @@ class Ros:
 
     file: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="FILE")] = None
     """The node's YAML; left out, the node's parameter `file` names it."""
-    managed: Switch = False
+    managed: kinds.Switch = False
     """Wait for the transitions configure and activate, instead of starting at once."""
     record: Annotated[Path | None, optional("MCAP")] = None
     """Record the drive into this file; after a reset, the next one into FILE_2.mcap."""
-    bag: OptionalFile = None
+    bag: kinds.OptionalFile = None
     """Take the messages of this bag of ROS 1 or 2, as `jaxnav replay` does, and send what comes of
     them and /clock; no vehicle hears a command."""
     rate: Annotated[float, Gt(0)] = 1.0
     """How fast the bag is played, times real time; inf is as fast as it goes."""
-    corner_backend: Detector = "aruco"
-    detector: Following = "follow"
+    corner_backend: kinds.Detector = "aruco"
+    detector: kinds.Following = "follow"
     period_s: _Period = 0.02
     timeout_s: _Timeout = 0.2
-    float64: Float64 = False
+    float64: kinds.Float64 = False
     ros_args: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WORDS")] = ()
     """Words for ROS itself, last on the line: --ros-args -p use_sim_time:=true."""
 
@@ -168,13 +145,13 @@ class Faults:
 
     only: Annotated[tuple[str, ...], tyro.conf.arg(metavar="TEXT")] = ()
     """Faults whose names hold one of these."""
-    rig: QCarRig = None
-    markers: QCarMarkers = None
-    vehicle: QCarVehicle = None
-    json: OptionalFile = None
+    rig: kinds.QCarRig = None
+    markers: kinds.QCarMarkers = None
+    vehicle: kinds.QCarVehicle = None
+    json: kinds.OptionalFile = None
     """Write the table into this file too."""
-    float64: Float64 = False
-    headless: Headless = False
+    float64: kinds.Float64 = False
+    headless: kinds.Headless = False
 
 
 @dataclass(frozen=True)
@@ -195,44 +172,44 @@ class ReplayRecording:
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
     """Drive (.mcap), ROS bag, folder of TagSLAM or .npz."""
-    rig: OptionalFile = None
+    rig: kinds.OptionalFile = None
     """Cameras, a rig file or a Kalibr camchain, in place of the recording's own."""
-    markers: OptionalFile = None
+    markers: kinds.OptionalFile = None
     """Marker map in place of the recording's own."""
-    vehicle: OptionalFile = None
+    vehicle: kinds.OptionalFile = None
     """Vehicle in place of the drive's own."""
-    route: OptionalFile = None
+    route: kinds.OptionalFile = None
     """Waypoints in place of the drive's own."""
-    params: OptionalFile = None
+    params: kinds.OptionalFile = None
     """Tuned parameters, of a drive in place of all of its own; --corner-sigma-px goes before."""
-    topics: OptionalFile = None
+    topics: kinds.OptionalFile = None
     """Which topic of a ROS bag is what: it is a drive then, or with an IMU a rig's recording."""
-    images: Switch = False
+    images: kinds.Switch = False
     """Look for the markers once more in the drive's recorded images."""
-    corner_backend: CornerBackend = "aruco"
+    corner_backend: kinds.CornerBackend = "aruco"
     """Marker detector, for images. apriltag needs the extra of that name."""
-    record_anew: Switch = False
+    record_anew: kinds.Switch = False
     """Record the drive anew, as replay.mcap."""
-    one_at_a_time: Switch = False
+    one_at_a_time: kinds.Switch = False
     """A pose from every marker alone, as in the paper, instead of one from all in view."""
     selector: Annotated[
-        Selector | None,
+        kinds.Selector | None,
         tyro.conf.arg(help_behavior_hint="(default: the drive's, or multi-hypothesis)"),
     ] = None
     """Which of the two poses of a marker is believed."""
     corner_sigma_px: Annotated[
-        CornerSigma | None, optional("PX", "(default: as the recording tells)")
+        kinds.CornerSigma | None, optional("PX", "(default: as the recording tells)")
     ] = None
     """Standard deviation of a corner coordinate."""
-    without_odometry: Switch = False
+    without_odometry: kinds.Switch = False
     """Localise a rig by its cameras alone, also where an IMU or odometry is recorded."""
-    smooth: Switch = False
+    smooth: kinds.Switch = False
     """Tell each pose what was seen after it as well as before, both branches weighed over all of
     it; the trajectory goes on where no marker is seen. Of a drive it is smoothed.tum."""
-    limit: Annotated[Count | None, optional("N", "(default: all)", int)] = None
+    limit: Annotated[kinds.Count | None, optional("N", "(default: all)", int)] = None
     """Stop after N frames, of a drive after N inputs."""
-    out: ResultsFolder = Path("out")
-    headless: Headless = False
+    out: kinds.ResultsFolder = Path("out")
+    headless: kinds.Headless = False
 
 
 @dataclass(frozen=True)
@@ -244,9 +221,25 @@ class ViewDrive:
 
     recording: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RECORDING")]
     """Recorded drive (.mcap)."""
-    out: OptionalFile = None
+    out: kinds.OptionalFile = None
     """Write this file (.rrd) instead of opening a window."""
-    headless: Headless = False
+    headless: kinds.Headless = False
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw a study or a recorded drive.
+
+    Of a study: flip-rate maps, curves with their intervals, reliability diagrams, and summary.json
+    with the measures of every cell; if it is not finished, as far as it is. Of a drive (.mcap):
+    drive.png, a map with what happened over time, and a summary in the terminal.
+    """
+
+    store: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STORE")]
+    """What `jaxnav study` wrote, or a recorded drive (.mcap)."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("out")
+    """Folder for the pictures."""
+    headless: kinds.Headless = False
 
 
 @dataclass(frozen=True)
@@ -262,14 +255,48 @@ class Locate:
     """Photograph, in any format that OpenCV reads, or HEIC; not turned by its EXIF orientation."""
     camera: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """Calibration: a rig file, a Kalibr camchain or a ROS camera_info YAML."""
-    marker_size_m: Annotated[SizeM, tyro.conf.arg(metavar="S")]
+    marker_size_m: Annotated[kinds.SizeM, tyro.conf.arg(metavar="S")]
     """Side of the black square, m."""
-    camera_name: OptionalName = None
+    camera_name: kinds.OptionalName = None
     """Which camera of the file took it, where the file holds several."""
     family: str = "tag36h11"
     """Marker family."""
-    corner_backend: Detector = "aruco"
-    as_json: Switch = False
+    corner_backend: kinds.Detector = "aruco"
+    as_json: kinds.Switch = False
     """Print JSON instead of a table."""
     out: Annotated[Path | None, optional("FILE")] = None
     """Draw the markers and both poses into this file, .png or .jpg, as large as the photograph."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check what a car will run with, and say what to do about each finding.
+
+    Looked at are the computer (packages, OpenCV, JAX, clock, disk), the four files, pictures that
+    the car's cameras took while it stood, and the plug-ins, which are opened and read but not
+    driven. Exit code 0: no error; 1: an error was found; 2: a file or a flag is not understood.
+    """
+
+    rig: kinds.QCarRig = None
+    markers: kinds.QCarMarkers = None
+    vehicle: kinds.QCarVehicle = None
+    route: kinds.QCarFile = None
+    """Start and waypoints."""
+    car: kinds.OptionalName = None
+    """Vehicle plug-in to open and read: an installed name or module:name."""
+    cameras: kinds.OptionalName = None
+    """Camera plug-in to open and read: an installed name or module:name."""
+    option: kinds.KeyValues = ()
+    """What the plug-ins are told."""
+    frame: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], optional("CAMERA=IMAGE", "(repeatable)")
+    ] = ()
+    """A picture by one of the rig's cameras, the car standing anywhere with a marker in view."""
+    drive: Annotated[Path | None, optional("FILE.mcap")] = None
+    """A recorded drive with eights, or stops and starts: are the cameras later than they say?"""
+    json: kinds.OptionalFile = None
+    """Write all findings into this file too."""
+
+    def __post_init__(self) -> None:
+        key_values("--option", self.option)
+        key_values("--frame", self.frame, "CAMERA=IMAGE")

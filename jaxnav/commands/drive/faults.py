@@ -3,9 +3,10 @@
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.drive.arguments import Faults
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.reading import given_files
 from jaxnav.drive.flags import names
 from jaxnav.errors import BadInput
-from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle, write_json
+from jaxnav.files import write_json
 from jaxnav.vehicles.conformance.faults import HEADER, Result, Trial, line, run_trial
 from jaxnav.vehicles.conformance.matrix import MATRIX
 
@@ -15,12 +16,7 @@ EXIT_BROKEN = 1
 def run(args: Faults) -> int:
     """Drive with every fault and print the results; 1 where a promise was not kept."""
     configure_jax(float64=args.float64, threads=1)
-    qcar = calib_dir() / "qcar"
-    trial = Trial(
-        load_rig(args.rig or qcar / "rig.yaml"),
-        load_markers(args.markers or qcar / "markers.yaml"),
-        load_vehicle(args.vehicle or qcar / "vehicle.yaml"),
-    )
+    trial = Trial(**given_files(args, ("rig", "markers", "vehicle"), or_qcars=True))
     suiting = [row for row in MATRIX if row.suits(trial)]
     rows = [row for row in suiting if not args.only or any(p in row.name for p in args.only)]
     if not rows:

@@ -123,10 +123,8 @@ def detectors_for(backend: str, family: str) -> list[Detector]:
 
 
 def _cameras(camera: Camera, lens_sigma_px: np.ndarray | None) -> list[Camera]:
-    """The camera, and three that are off by one sigma: in focal length, in x and y of the centre.
-
-    Both focal lengths are off together: what leaves one unsure does so to the other.
-    """
+    """The camera, and three that are off by one sigma: in both focal lengths, which what leaves one
+    unsure does to the other, and in x and y of the centre."""
     if lens_sigma_px is None:
         return [camera]
     focal, centre = jnp.asarray(lens_sigma_px[:2]), jnp.asarray(lens_sigma_px[2:])
@@ -239,15 +237,13 @@ def notes(
     Args:
         markers: as in the report.
         orientation: of the photograph, 1 to 8, as EXIF counts.
-        knows_lens: whether the camera's file has sigmas of its lens.
         blurred: whether no marker could be read without restoring the photograph.
     """
     size_m = args.marker_size_m
-    if size_m > _LARGE_M:
-        other = f"{size_m / 1000:g} if {size_m:g} are mm, {size_m / 100:g} if they are cm"
-        yield f"--marker-size-m {size_m:g} is {size_m:g} m: {other}"
-    elif size_m < _SMALL_M:
+    if not _SMALL_M <= size_m <= _LARGE_M:
         other = f"{1000 * size_m:g} if it was divided by 1000 twice"
+        if size_m > _LARGE_M:
+            other = f"{size_m / 1000:g} if {size_m:g} are mm, {size_m / 100:g} if they are cm"
         yield f"--marker-size-m {size_m:g} is {size_m:g} m: {other}"
     if orientation != 1:
         turned = f"turned by {_TURNED_DEG[orientation]} deg" if orientation in _TURNED_DEG else ""
@@ -300,9 +296,6 @@ def _other_family(args: Locate, image: np.ndarray) -> Iterator[str]:
 def table(report: dict[str, Any]) -> str:
     """The report as text, a line for each pose."""
     said = [f"note: {sentence}" for sentence in report["notes"]]
-    if not report["markers"]:
-        none = f"{report['image']}: no marker of {report['family']} in view"
-        return "\n".join([none, *said])
     lines = [
         f"{'id':>5} {'pose':>4} {'x (m)':>8} {'y (m)':>8} {'z (m)':>8} {'view (deg)':>10} "
         f"{'error (px)':>10} {'ratio':>6} {'P(flip)':>8} {'sigma (m)':>9} {'sigma (deg)':>11}"
@@ -320,15 +313,13 @@ def table(report: dict[str, Any]) -> str:
                 f"{doubt_text} {np.linalg.norm(pose['position_sigma_m']):>9.4f} "
                 f"{np.linalg.norm(pose['rotation_sigma_deg']):>11.2f}"
             )
+    if not report["markers"]:
+        lines = [f"{report['image']}: no marker of {report['family']} in view"]
     return "\n".join([*lines, *said])
 
 
 def _draw(
-    path: Path,
-    image: np.ndarray,
-    camera: Camera,
-    size_m: float,
-    markers: Sequence[dict[str, Any]],
+    path: Path, image: np.ndarray, camera: Camera, size_m: float, markers: list[dict[str, Any]]
 ) -> None:
     """Draw the markers and both poses of each into the photograph."""
     from jaxnav.pictures.localisation import PHOTO_DPI, AnnotatedFrame, photo_with_poses

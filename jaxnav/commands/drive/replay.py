@@ -1,9 +1,7 @@
 """`jaxnav replay`: localise a recorded rig in every frame, or drive a recorded drive again."""
 
 import dataclasses
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,23 +10,18 @@ from jaxnav.commands.drive import replay_drive
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import Selector
 from jaxnav.commands.process import configure_jax
-from jaxnav.commands.report import corners_in_world, save_figure
+from jaxnav.commands.reading import given_files
+from jaxnav.commands.report import corners_in_world, write_report
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible
-from jaxnav.files import (
-    apply_params,
-    load_markers,
-    load_params,
-    load_rig,
-    load_topics,
-    output_folder,
-    write_json,
-    write_tum,
-)
+from jaxnav.files import apply_params, output_folder, write_tum
 from jaxnav.recordings.other.odometry_delay import odometry_delay
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 _SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history
@@ -40,9 +33,9 @@ def run(args: Arguments) -> int:
         return replay_drive.run(args)
     args = dataclasses.replace(args, selector=args.selector or _DEFAULT_SELECTOR)
     configure_jax(float64=True, threads=1)
-    params = _loaded(load_params, args.params)
-    files = (load_rig, args.rig), (load_markers, args.markers), (load_topics, args.topics)
-    recording = read_recording(args.recording, *(_loaded(*file) for file in files))
+    files = given_files(args, ("params", "rig", "markers", "topics"))
+    params, *others = (files.get(name) for name in ("params", "rig", "markers", "topics"))
+    recording = read_recording(args.recording, *others)
     if args.limit is not None:
         recording = recording.first(args.limit)
     if args.without_odometry:
@@ -69,22 +62,16 @@ def run(args: Arguments) -> int:
         )
     summary = _summary(args, recording, result)
     _write_tracks(args, recording, result)
-    _draw(recording, result, _text(summary), out / "report.png")
-    write_json(out / "summary.json", summary)
-    print(_text(summary))
+    lines = [_text(summary)]
     if recording.odometry is not None:
         track = int(np.argmax(result.seen.sum(axis=0)))  # the one that sees most
         poses, seen = result.T_world_vehicle[:, track], result.seen[:, track]
         delay = odometry_delay(recording.odometry, recording.stamps_ns, poses, seen)
         if delay is not None:
-            print(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
-    print(f"report in {visible(out)}")
+            lines.append(f"{delay}: odom_delay_s in tagslam.yaml takes it away")
+    lines.append(f"report in {visible(out)}")
+    write_report(out, summary, lines, report=_picture(recording, result, _text(summary)))
     return 0
-
-
-def _loaded(load: Callable[[Path], Any], path: Path | None) -> Any:
-    """The content of a file; None where none is given."""
-    return None if path is None else load(path)
 
 
 def _summary(args: Arguments, recording: Recording, result: Replay) -> dict[str, Any]:
@@ -119,7 +106,6 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
     position_m, rotation_deg = errors(result, recording)
     judged = result.seen & recording.reference.valid[:, None]
     settled = judged & (frames_in_view(result.seen) > _SETTLED_FRAMES)
-
     wrong, outlier = np.asarray(result.branch.wrong), np.asarray(result.branch.outlier)
 
     def fraction(of: np.ndarray, among: np.ndarray) -> float:
@@ -158,7 +144,7 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
         )
 
 
-def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
+def _picture(recording: Recording, result: Replay, title: str) -> "Figure":
     # It imports matplotlib, which a drive that is compared needs not.
     from jaxnav.pictures.localisation import localisation_report
 
@@ -173,7 +159,7 @@ def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
         names = "position error (m)", "rotation error (deg)"
         off = errors(result, recording)
         drawn = {name: values.T.ravel() for name, values in zip(names, off, strict=True)}
-    picture = localisation_report(
+    return localisation_report(
         np.tile(times_s, tracks),
         positions_m.transpose(1, 0, 2).reshape(-1, 3),
         reference_m,
@@ -182,7 +168,6 @@ def _draw(recording: Recording, result: Replay, title: str, path: Path) -> None:
         title=title,
         connected=tracks == 1,
     )
-    save_figure(picture, path)
 
 
 def _text(summary: dict[str, Any]) -> str:

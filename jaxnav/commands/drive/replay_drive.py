@@ -3,19 +3,16 @@
 import dataclasses
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive.arguments import ReplayRecording as Arguments
 from jaxnav.commands.kinds import flag_of
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.reading import given_files, read_shown
-from jaxnav.commands.report import corners_in_world, save_figure
+from jaxnav.commands.report import corners_in_world, write_report
 from jaxnav.drive.flags import Fault, Health, Reject, counts
 from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput, visible
@@ -25,7 +22,6 @@ from jaxnav.files import (
     load_params,
     load_topics,
     output_folder,
-    write_json,
     write_tum,
 )
 from jaxnav.files.configuration import step_folder
@@ -45,62 +41,22 @@ from jaxnav.recordings.plausible import keep_plausible
 from jaxnav.recordings.recorder import Recorder
 from jaxnav.recordings.records import Outcomes
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 EXIT_DIFFERS = 1
 _FILES = ("rig", "markers", "vehicle", "route")
 _FOR_RIGS = ("one_at_a_time", "without_odometry")
 _FOR_DRIVES = ("vehicle", "route", "images", "record_anew")
 _OVERRIDES = (*_FILES, "params", "selector", "corner_sigma_px", "images")
-
-
-@dataclass(frozen=True)
-class Track:
-    """The track of a drive that is driven again: N rows in the order of their outcomes.
-
-    Attributes:
-        now_ns: when each input reached the pilot.
-        poses: x_m y_m psi_rad.
-        Ts_world_vehicle: wxyz_xyz.
-        health, faults, rejects: values of `Health`, `Fault` and `Reject`.
-        restarts, restart_reason: how many so far, and why the last one.
-    """
-
-    now_ns: Int[np.ndarray, " N"]
-    poses: Float[np.ndarray, "N 3"]
-    Ts_world_vehicle: Float[np.ndarray, "N 7"]
-    located: Bool[np.ndarray, " N"]
-    decided: Bool[np.ndarray, " N"]
-    health: Int[np.ndarray, " N"]
-    faults: Int[np.ndarray, " N"]
-    rejects: Int[np.ndarray, " N"]
-    restarts: Int[np.ndarray, " N"]
-    restart_reason: Shaped[np.ndarray, " N"]
-
-    def summary(self) -> dict[str, Any]:
-        """Counts of faults and rejects, shares of health, and the last pose and restarts."""
-        return {
-            "states": len(self.health),
-            "duration_s": float((self.now_ns[-1] - self.now_ns[0]) / 1e9),
-            "health_shares": {h.name: float(np.mean(self.health == h)) for h in Health},
-            "located_share": float(np.mean(self.located)),
-            "decided_share": float(np.mean(self.decided)),
-            "faults": counts(Fault, self.faults),
-            "rejects": counts(Reject, self.rejects),
-            "final_pose": self.poses[-1] if self.located[-1] else None,
-            "restarts": int(self.restarts[-1]),
-            "restart_reason": str(self.restart_reason[-1]),
-        }
-
-    def distances_to(
-        self, recorded: Outcomes
-    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-        """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
-        if not len(recorded.now_ns):
-            return np.full(len(self.now_ns), np.nan), np.full(len(self.now_ns), np.nan)
-        index = np.searchsorted(recorded.now_ns, self.now_ns)
-        known = index < len(recorded.now_ns)
-        index = np.where(known, index, 0)
-        known &= (recorded.now_ns[index] == self.now_ns) & recorded.located[index] & self.located
-        return distances(self.poses, recorded.pose[index], known)
+# Of a track: `pose` is x_m y_m psi_rad, `T_world_vehicle` wxyz_xyz.
+_ROW = np.dtype(
+    [
+        ("now_ns", np.int64), ("pose", float, 3), ("T_world_vehicle", float, 7), ("located", bool),
+        ("decided", bool), ("health", int), ("faults", int), ("rejects", int), ("restarts", int),
+        ("restart_reason", object),
+    ]
+)  # fmt: skip
 
 
 def is_for(args: Arguments) -> bool:
@@ -148,16 +104,13 @@ def run(args: Arguments) -> int:
     if params is not None:
         print(params.describe())
     track = _replayed(args, setup, inputs, comparison)
-    summary: dict[str, Any] = {
-        "recording": str(args.recording),
-        "selector": setup.selector,
-        "parameters": setup.parameters,
-    }
-    summary |= track.summary()
-    recorded_m, off = None, None
+    located, Ts_world_vehicle = track["located"], track["T_world_vehicle"]
+    write_tum(out / "trajectory.tum", track["now_ns"][located] / 1e9, Ts_world_vehicle[located])
+    summary = _summary(args, setup, track)
+    recorded_m, off, figures = None, None, dict[str, Any]()
     if log is not None:
         recorded = keep_plausible(log.outcomes)[0]
-        off = track.distances_to(recorded)
+        off = _distances(track, recorded)
         recorded_m = np.where(recorded.located[:, None], recorded.pose * [1, 1, 0], np.nan)
         summary |= {
             "changed": changed,
@@ -173,19 +126,14 @@ def run(args: Arguments) -> int:
             "first_difference": comparison.first and dataclasses.asdict(comparison.first),
         }
     else:
-        positions_m = np.where(track.located[:, None], track.Ts_world_vehicle[:, 4:], np.nan)
-        times_s = (track.now_ns - track.now_ns[0]) / 1e9
-        path = out / "report.png"
-        _draw(path, setup, times_s, positions_m, recorded_m, off, _text(summary))
-    text = _text(summary)
+        positions_m = np.where(located[:, None], Ts_world_vehicle[:, 4:], np.nan)
+        tracks = track["now_ns"], positions_m, recorded_m
+        figures["report"] = _picture(setup, *tracks, off, _text(summary))
+    lines = [_text(summary)]
     if events is not None:
-        summary["smoothing"] = _smooth(args, events, setup)
-        text += f"\n{_smoothing_text(summary['smoothing'])}"
-    write_json(out / "summary.json", summary)
-    located = track.located
-    write_tum(out / "trajectory.tum", track.now_ns[located] / 1e9, track.Ts_world_vehicle[located])
-    print(text)
-    print(f"summary in {visible(out)}")
+        summary["smoothing"], figures["smoothed"] = _smooth(args, events, setup)
+        lines.append(_smoothing_text(summary["smoothing"]))
+    write_report(out, summary, [*lines, f"summary in {visible(out)}"], **figures)
     return EXIT_DIFFERS if comparison is not None and comparison.first else 0
 
 
@@ -219,7 +167,8 @@ def _read(
 
 def _replayed(
     args: Arguments, setup: DriveSetup, inputs: Sequence[Input], comparison: Comparison | None
-) -> Track:
+) -> np.ndarray:
+    """The track that is driven again, a row of `_ROW` for each outcome."""
     rows = []
     outcomes = replay_drive(inputs, setup, step_folder())
     with ExitStack() as closing:
@@ -236,11 +185,11 @@ def _replayed(
         update = update_after_compiling(bar)
         for given, outcome in zip(inputs, outcomes, strict=True):
             # Not the bank of hypotheses: those of a long drive are gigabytes.
-            output, reason = outcome.output, outcome.restart_reason
-            poses = np.asarray(outcome.pose, float), np.asarray(outcome.T_world_vehicle, float)
-            known = bool(output.located), bool(output.decided)
-            flags = int(outcome.health), int(outcome.faults), int(outcome.rejects)
-            rows.append((outcome.now_ns, *poses, *known, *flags, outcome.restarts, reason))
+            poses, output = (outcome.pose, outcome.T_world_vehicle), outcome.output
+            flags = outcome.health, outcome.faults, outcome.rejects
+            restarted = outcome.restarts, outcome.restart_reason
+            row = outcome.now_ns, *poses, output.located, output.decided, *flags, *restarted
+            rows.append(np.array(row, _ROW))
             if comparison is not None:
                 comparison.look(outcome)
             if recorder is not None:
@@ -250,28 +199,58 @@ def _replayed(
             recorder.close(timeout_s=60.0)
             if recorder.failed is not None:
                 raise BadInput("--record-anew", recorder.failed.replace(str(beside), str(path)))
-    return Track(*map(np.array, zip(*rows, strict=True)))
+    return np.stack(rows)
 
 
-def _draw(
-    path: Path,
+def _summary(args: Arguments, setup: DriveSetup, track: np.ndarray) -> dict[str, Any]:
+    """What was driven, counts of faults and rejects, shares of health, last pose and restarts."""
+    last = track[-1]
+    return {
+        "recording": str(args.recording),
+        "selector": setup.selector,
+        "parameters": setup.parameters,
+        "states": len(track),
+        "duration_s": float((last["now_ns"] - track["now_ns"][0]) / 1e9),
+        "health_shares": {h.name: float(np.mean(track["health"] == h)) for h in Health},
+        "located_share": float(np.mean(track["located"])),
+        "decided_share": float(np.mean(track["decided"])),
+        "faults": counts(Fault, track["faults"]),
+        "rejects": counts(Reject, track["rejects"]),
+        "final_pose": last["pose"] if last["located"] else None,
+        "restarts": int(last["restarts"]),
+        "restart_reason": str(last["restart_reason"]),
+    }
+
+
+def _distances(track: np.ndarray, recorded: Outcomes) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (N,) m and (N,) rad to the recorded track, NaN where either has no pose."""
+    if not len(recorded.now_ns):
+        return np.full(len(track), np.nan), np.full(len(track), np.nan)
+    index = np.searchsorted(recorded.now_ns, track["now_ns"])
+    known = index < len(recorded.now_ns)
+    index = np.where(known, index, 0)
+    known &= (recorded.now_ns[index] == track["now_ns"]) & recorded.located[index]
+    return distances(track["pose"], recorded.pose[index], known & track["located"])
+
+
+def _picture(
     setup: DriveSetup,
-    times_s: np.ndarray,
+    stamps_ns: np.ndarray,
     positions_m: np.ndarray,
     others_m: np.ndarray | None,
     off: tuple[np.ndarray, np.ndarray] | None,
     title: str,
     names: tuple[str, str] = ("estimate", "reference"),
-) -> None:
-    """Draw a track and another one beside it, which is off by m and rad."""
-    # It imports matplotlib.
+) -> "Figure":
+    """A track and another one beside it, which is off by m and rad."""
+    # It imports matplotlib, which a drive that is compared needs not.
     from jaxnav.pictures.localisation import localisation_report
 
     shown = {}
     if off is not None:
         shown = {"position off (m)": off[0], "heading off (deg)": np.rad2deg(off[1])}
-    picture = localisation_report(
-        times_s,
+    return localisation_report(
+        (stamps_ns - stamps_ns[0]) / 1e9,
         positions_m,
         others_m,
         # A logarithmic axis shows no zero.
@@ -280,7 +259,6 @@ def _draw(
         title=title,
         names=names,
     )
-    save_figure(picture, path)
 
 
 def _text(summary: dict[str, Any]) -> str:
@@ -316,15 +294,17 @@ def _verdict(summary: dict[str, Any]) -> str:
     return f"{compared} states, as recorded but for rounding (by another version or machine)"
 
 
-def _smooth(args: Arguments, events: DriveEvents, setup: DriveSetup) -> dict[str, Any]:
-    """Write the track by all that was seen, smoothed.tum and smoothed.png; what it has changed."""
+def _smooth(
+    args: Arguments, events: DriveEvents, setup: DriveSetup
+) -> tuple[dict[str, Any], "Figure"]:
+    """Write the track by all that was seen, smoothed.tum; what that has changed, and a picture."""
     with progress_bar(
         total=2 * len(events), unit="event", desc="smooth", disable=args.headless
     ) as bar:
         filtered, smoothed = smooth_drive(events, setup, update_after_compiling(bar))
     stamps_s, located = smoothed.stamps_ns / 1e9, smoothed.located
     write_tum(args.out / "smoothed.tum", stamps_s[located], smoothed.Ts_world_vehicle[located])
-    shift_m, turn_rad = filtered.distances_to(smoothed)
+    off = shift_m, turn_rad = filtered.distances_to(smoothed)
     summary = {
         "events": len(events),
         "filtered": _known(filtered),
@@ -332,49 +312,38 @@ def _smooth(args: Arguments, events: DriveEvents, setup: DriveSetup) -> dict[str
         "rms_position_difference_m": _rms(shift_m[filtered.decided]),
         "rms_heading_difference_deg": _rms(np.rad2deg(turn_rad[filtered.decided])),
     }
-    _draw(
-        args.out / "smoothed.png",
-        setup,
-        stamps_s - stamps_s[0],
-        filtered.positions_m,
-        smoothed.positions_m,
-        (shift_m, turn_rad),
-        _smoothing_text(summary),
-        ("filtered", "smoothed"),
-    )
-    return summary
-
-
-def _smoothing_text(summary: dict[str, Any]) -> str:
-    """What smoothing has changed, in two lines."""
-    shares = (summary[of]["decided_share"] for of in ("filtered", "smoothed"))
-    before, after = (_sigmas(summary[of]) for of in ("filtered", "smoothed"))
-    off_cm = 100 * summary["rms_position_difference_m"]
-    decided = "decided {:.0%} of {} events, smoothed {:.0%}"
-    first, second = shares
-    return (
-        f"{decided.format(first, summary['events'], second)}; sigma {before}, smoothed {after}\n"
-        f"once decided, the filter was off the smoothed track by {off_cm:.2g} cm and "
-        f"{summary['rms_heading_difference_deg']:.2g} deg (rms)"
-    )
+    tracks, names = (filtered.positions_m, smoothed.positions_m), ("filtered", "smoothed")
+    title = _smoothing_text(summary)
+    return summary, _picture(setup, smoothed.stamps_ns, *tracks, off, title, names)
 
 
 def _known(track: DriveTrack) -> dict[str, float]:
     """Shares of the events, and how well the pose is known where it is decided."""
+
+    def median(values: np.ndarray) -> float:
+        return float(np.median(values)) if len(values) else np.nan
+
     return {
         "located_share": float(np.mean(track.located)),
         "decided_share": float(np.mean(track.decided)),
-        "median_sigma_m": _median(track.sigma_m[track.decided]),
-        "median_sigma_deg": _median(np.rad2deg(track.sigma_rad[track.decided])),
+        "median_sigma_m": median(track.sigma_m[track.decided]),
+        "median_sigma_deg": median(np.rad2deg(track.sigma_rad[track.decided])),
     }
 
 
-def _sigmas(known: dict[str, float]) -> str:
-    return f"{100 * known['median_sigma_m']:.2g} cm {known['median_sigma_deg']:.2g} deg"
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else np.nan
+def _smoothing_text(summary: dict[str, Any]) -> str:
+    """What smoothing has changed, in two lines."""
+    was, now = summary["filtered"], summary["smoothed"]
+    before, after = (
+        f"{100 * of['median_sigma_m']:.2g} cm {of['median_sigma_deg']:.2g} deg" for of in (was, now)
+    )
+    return (
+        f"decided {was['decided_share']:.0%} of {summary['events']} events, smoothed "
+        f"{now['decided_share']:.0%}; sigma {before}, smoothed {after}\n"
+        "once decided, the filter was off the smoothed track by "
+        f"{100 * summary['rms_position_difference_m']:.2g} cm and "
+        f"{summary['rms_heading_difference_deg']:.2g} deg (rms)"
+    )
 
 
 def _rms(values: np.ndarray) -> float:

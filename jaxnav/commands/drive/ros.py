@@ -13,9 +13,8 @@ from functools import partial
 from typing import Any
 
 from jaxnav.commands.drive.arguments import Ros
-from jaxnav.commands.drive.ros_body import PreparedBody
 from jaxnav.commands.drive.ros_drive import OVER, PreparedDrive
-from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared
+from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared, PreparedBody
 from jaxnav.commands.process import configure_jax
 from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput, visible
@@ -140,8 +139,7 @@ class _Node:
             self._prepared.close()
         self._prepared = None
 
-    def _shutdown(self) -> None:
-        self._cleanup()
+    _shutdown = _cleanup
 
     def _stop(self, reason: str) -> None:
         activity, self._activity = self._activity, None

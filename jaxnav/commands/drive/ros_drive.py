@@ -18,7 +18,7 @@ from jaxnav.commands.drive.observers import (
     ExposureWatch,
     closing_notes,
 )
-from jaxnav.commands.drive.ros_setup import LOOK_S, Activity, Prepared, path_of
+from jaxnav.commands.drive.ros_setup import Activity, Prepared, path_of
 from jaxnav.commands.drive.run import Drive, compiled_pilot, guarding_process, searches_for
 from jaxnav.core.filter.errors import EACH
 from jaxnav.core.filter.odometry import LEARNT, SENSORS_END
@@ -150,7 +150,9 @@ class PreparedDrive(Prepared):
             if drive.heard is not None:
                 self._say(drive.heard)
 
-        return _Working(partial(drive.run, pilot, self._searches, observers), trip, close, keeper)
+        return Activity(
+            partial(drive.run, pilot, self._searches, observers), trip, close, keeper.save
+        )
 
     def _play(
         self,
@@ -181,45 +183,7 @@ class PreparedDrive(Prepared):
             _close(observers, contained, self._say)
             connection.forget(clock)
 
-        return _Working(play, lambda reason: over.set(), close, keeper)
-
-
-class _Working:
-    """A drive in a thread of its own. Implements `Activity`."""
-
-    def __init__(
-        self,
-        work: Callable[[], str | None],
-        trip: Callable[[str], None],
-        close: Callable[[], None],
-        keeper: "LearntKeeper",
-    ):
-        """Args:
-        work: returns why it has ended by itself; None where it was tripped.
-        trip: tells `work` to end, for a reason.
-        close: called once it has ended.
-        """
-        self.ended: str | None = None
-        self.save = keeper.save
-        self._work, self._trip, self._close = work, trip, close
-        self._thread = threading.Thread(target=self._works, name="the loop", daemon=True)
-        self._thread.start()
-
-    def stop(self, reason: str) -> None:
-        """See `Activity`."""
-        while self._thread.is_alive():
-            self._trip(reason)
-            self._thread.join(LOOK_S)
-        self._close()
-
-    def _works(self) -> None:
-        try:
-            self.ended = self._work()
-        except BaseException as error:  # a plug-in's, or a signal: the node says so and rests
-            # A person's mistake or a signal as they are, all else with its kind.
-            known = isinstance(error, BadInput) or not isinstance(error, Exception)
-            text = str(error)
-            self.ended = text if known and text else f"{type(error).__name__}: {text}"
+        return Activity(play, lambda reason: over.set(), close, keeper.save)
 
 
 class LearntKeeper(DriveObserver):

@@ -1,48 +1,87 @@
-"""What a driven vehicle and a rig that moves freely share in the node of ROS 2."""
+"""What the node of ROS 2 runs: what a driven vehicle and a rig that moves freely share, and such a
+rig, without odometry or with that of other software."""
 
 import copy
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from jaxnav.commands.drive.arguments import Ros
+from jaxnav.commands.drive.run import searches_for
+from jaxnav.core.filter.free import ConstantVelocity
+from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import OdometryErrors
+from jaxnav.core.navigator import Navigator
+from jaxnav.drive.compiled_step import compiled_step
+from jaxnav.drive.interfaces import Camera, Setup
+from jaxnav.drive.pilot import Outcome
 from jaxnav.drive.signals import Signals
 from jaxnav.errors import BadInput
-from jaxnav.files import load_markers, load_rig
+from jaxnav.files import apply_params, load_markers, load_params, load_rig
+from jaxnav.files.configuration import step_folder
 from jaxnav.files.ros import RosFile
 from jaxnav.files.validation import at
 from jaxnav.recordings.drive_setup import PILOT_SELECTORS
+from jaxnav.recordings.ros.body import BodyTracker
 from jaxnav.recordings.ros.odometry_messages import NAV_ODOMETRY
+from jaxnav.recordings.ros.odometry_track import GrowingTrack
 from jaxnav.vehicles.ros.connection import Connection
 from jaxnav.vehicles.ros.lenses import await_lenses, with_lenses
-from jaxnav.vehicles.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf
+from jaxnav.vehicles.ros.odom_frame import IDENTITY, OdomFrame, OdomPose, OdomTf, pose_of
 from jaxnav.vehicles.ros.publisher import FrameNames, Publisher
+from jaxnav.vehicles.ros2_cameras import open_cameras
 
 LOOK_S = 0.05
 _TF = "tf2_msgs/msg/TFMessage"
 
 
-class Activity(Protocol):
-    """What the node does between `activate` and `deactivate`."""
+class Activity:
+    """What the node does between `activate` and `deactivate`, in a thread of its own.
 
-    ended: str | None
-    """Why it ended by itself; None while it goes on."""
+    Attributes:
+        ended: why it ended by itself; None while it goes on.
+        save: writes what it has learnt into new files in a folder, and returns what was written;
+            where it can't it raises BadInput, and has written nothing.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[], str | None],
+        trip: Callable[[str], None],
+        close: Callable[[], None],
+        save: Callable[[str], str],
+    ):
+        """Args:
+        work: returns why it has ended by itself; None where it was tripped.
+        trip: tells `work` to end, for a reason.
+        close: called once it has ended.
+        """
+        self.ended: str | None = None
+        self.save = save
+        self._work, self._trip, self._close = work, trip, close
+        self._thread = threading.Thread(target=self._works, name="the loop", daemon=True)
+        self._thread.start()
 
     def stop(self, reason: str) -> None:
         """Stop it and wait until all is closed. May be called any number of times."""
-        ...
+        while self._thread.is_alive():
+            self._trip(reason)
+            self._thread.join(LOOK_S)
+        self._close()
 
-    def save(self, folder: str) -> str:
-        """Write what it has learnt into new files in a folder; return what was written.
-
-        Raises:
-            BadInput: it can't, and has written nothing.
-        """
-        ...
+    def _works(self) -> None:
+        try:
+            self.ended = self._work()
+        except BaseException as error:  # a plug-in's, or a signal: the node says so and rests
+            # A person's mistake or a signal as they are, all else with its kind.
+            known = isinstance(error, BadInput) or not isinstance(error, Exception)
+            text = str(error)
+            self.ended = text if known and text else f"{type(error).__name__}: {text}"
 
 
 class Prepared(ABC):
@@ -164,6 +203,95 @@ class Prepared(ABC):
         check = self._signals.check
         lenses = await_lenses(file.path, file.camera_info, file.is_rectified, check)
         return with_lenses(rig, lenses) if lenses else rig
+
+
+class PreparedBody(Prepared):
+    """A rig that moves freely."""
+
+    def begin(self) -> Activity:
+        connection, searches = self._connection, self._searches
+        tracker, ends, over = self._tracker(self.publisher.publish), list[Any](), threading.Event()
+        if self._file.odometry is not None:
+            clock = connection.source_clock()
+
+            def take(message: Any) -> None:
+                pose = pose_of(message.pose.pose.position, message.pose.pose.orientation)
+                if pose is not None:
+                    tracker.add_odometry(clock.time_ns(message.header.stamp), pose)
+
+            ends.append(connection.listen(NAV_ODOMETRY, self._file.odometry, take))
+        cameras = open_cameras(self._setup, None)
+
+        def look(index: int, camera: Camera) -> None:
+            def turn() -> None:
+                frame = camera.read(LOOK_S)
+                if frame is not None:
+                    sighted = searches[index].look(frame, None)
+                    if sighted.detections is not None:
+                        tracker.add(index, sighted.stamp_ns, sighted.detections)
+
+            name, rest = f"camera {camera.name}", lambda problem: over.wait(LOOK_S)
+            fenced = connection.contained.of(name, turn, rest)
+            while not over.is_set():
+                fenced()
+
+        def track() -> None:
+            threads = [
+                threading.Thread(target=look, args=each, daemon=True) for each in enumerate(cameras)
+            ]
+            for thread in threads:
+                thread.start()
+            over.wait()
+            for thread in threads:
+                thread.join(1.0)
+
+        def close() -> None:
+            for camera in cameras:
+                camera.close()
+            connection.forget(*ends)
+            tracker.close()
+
+        def save(folder: str) -> str:
+            raise BadInput("save", "a rig that moves freely learns nothing of its cameras")
+
+        tracker.start()
+        return Activity(track, lambda reason: over.set(), close, save)
+
+    def _read(self) -> Setup:
+        for flag, given in (("--record", self._args.record), ("--bag", self._args.bag)):
+            if given is not None:
+                raise BadInput(flag, "is for drives: the file names no vehicle")
+        rig, markers = self._rig(), load_markers(path_of(self._file, "markers"))
+        self._connection.ros_time = True  # the same stamps give the same poses, whenever they come
+        nothing: Any = None
+        options = self._file.options(False, self._connection.sim_time) | {"stamps": "ros"}
+        return Setup(rig, markers, nothing, (0.0, 0.0, 0.0), 0, options)
+
+    def _compile(self) -> None:
+        file, setup, odometry_errors = self._file, self._setup, None
+        if file.odometry is not None:
+            sigma = file.odometry_sigma.sigma()
+            odometry_errors = OdometryErrors.create(sigma, file.T_vehicle_sensor[4:])
+        navigator = Navigator(
+            rig=setup.rig,
+            markers=setup.markers,
+            selector=make_selector(file.selector),
+            motion=ConstantVelocity(odometry_errors=odometry_errors),
+            corner_sigma_px=file.corner_sigma_px,
+        )
+        if (params := file.file("params")) is not None:
+            navigator = apply_params(navigator, load_params(params))
+        self._navigator, self._step = navigator, compiled_step(navigator, step_folder())
+        self._searches = searches_for(self._args.corner_backend, setup.rig, setup.markers)
+        warm_ups = self._tracker(lambda outcome: None).warm_up, *(s.warm_up for s in self._searches)
+        self._timed(lambda: [warm_up() for warm_up in warm_ups])
+
+    def _tracker(self, publish: Callable[[Outcome], None]) -> BodyTracker:
+        file, contained, track = self._file, self._connection.contained, None
+        if file.odometry is not None:
+            track = GrowingTrack(file.T_vehicle_sensor, file.odometry_delay_s)
+        cameras = len(file.cameras)
+        return BodyTracker(self._navigator, self._step, cameras, publish, track, contained)
 
 
 def path_of(file: RosFile, key: str) -> Path:

@@ -11,15 +11,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
 from jaxnav.commands.drive.arguments import Run
-from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.observers import (
+    DelayWatch,
     DriveObserver,
     DriveRecorder,
     ExposureWatch,
@@ -30,6 +29,7 @@ from jaxnav.commands.drive.observers import (
 from jaxnav.commands.drive.status_line import StatusLine
 from jaxnav.commands.kinds import key_values
 from jaxnav.commands.process import configure_jax
+from jaxnav.commands.reading import given_files
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import Vehicle
@@ -46,7 +46,7 @@ from jaxnav.drive.priority import before_others
 from jaxnav.drive.seeing import Eyes, Search
 from jaxnav.drive.signals import EXIT_STOPPED, Signals
 from jaxnav.errors import BadInput, Containment, visible
-from jaxnav.files import calib_dir, load_markers, load_params, load_rig, load_route, load_vehicle
+from jaxnav.files import load_params
 from jaxnav.files.configuration import step_folder
 from jaxnav.files.vehicles import may_resume
 from jaxnav.recordings.drive_setup import DriveSetup
@@ -119,29 +119,14 @@ def _setup(args: Run, options: Mapping[str, str]) -> DriveSetup:
     factory = plugins.load_factory("--car", plugins.VEHICLES, args.car)
     plugins.load_factory("--cameras", plugins.CAMERAS, args.cameras or args.car)
     own = factory.own_files(options) if isinstance(factory, HasOwnFiles) else None
-    qcar = calib_dir() / "qcar"
-
-    def chosen(name: str, path: Path | None, load: Callable[[Path], Any]) -> Any:
-        if path is None and own is not None:
-            return getattr(own, name)
-        return load(path or qcar / f"{name}.yaml")
-
-    return DriveSetup(
-        rig=chosen("rig", args.rig, load_rig),
-        markers=chosen("markers", args.markers, load_markers),
-        vehicle=chosen("vehicle", args.vehicle, load_vehicle),
-        route=chosen("route", args.route, load_route),
-        selector=args.selector,
-        float64=args.float64,
-        relocate=args.relocate,
-    )
+    names = ("rig", "markers", "vehicle", "route")
+    files = given_files(args, names, or_qcars=own is None)
+    files |= {name: getattr(own, name) for name in names if name not in files}
+    return DriveSetup(**files, selector=args.selector, float64=args.float64, relocate=args.relocate)
 
 
 def open_observers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[DriveObserver]:
-    """Open the observers that the arguments ask for.
-
-    Args:
-        closing: closes them in the end.
+    """Open the observers that the arguments ask for, which `closing` closes in the end.
 
     Raises:
         BadInput: the file can't be written, Rerun is missing or its window does not open.
@@ -189,21 +174,14 @@ def searches_for(
     """
     detectors = make_detectors(markers, corner_backend)
     rig = jax.device_get(rig)  # NumPy indexes its cameras without compiling anything
+    trackers = [Tracker(*rig.timing(c)) if follow else None for c in range(len(rig))]
     return [
-        Search(
-            c,
-            rig.image_sizes_px[c],
-            rig.camera(c),
-            detectors,
-            Tracker(*rig.timing(c)) if follow else None,
-        )
-        for c in range(len(rig))
+        Search(c, rig.image_sizes_px[c], rig.camera(c), detectors, tracker)
+        for c, tracker in enumerate(trackers)
     ]
 
 
-def compiled_pilot(
-    args: Run, setup: DriveSetup, others: Sequence[Callable[[], None]] = ()
-) -> Pilot:
+def compiled_pilot(args: Run, setup: DriveSetup, others: Sequence[Callable[[], None]]) -> Pilot:
     """A pilot that is compiled and warmed up.
 
     Args:

@@ -28,7 +28,6 @@ from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.commands.simulate.rendered_world import RenderedCameras, RenderedWorld, expected_corners
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, wrap_angle_np
-from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import Origin, planar_in_world, points_in_world, poses_in_world
 from jaxnav.detection import Detections, Detector, Tracker, make_detectors
 from jaxnav.detection.families import dictionary
@@ -91,7 +90,7 @@ class Method(NamedTuple):
 
     name: str
     detectors: Sequence[Detector]
-    navigator: Methods  # alone
+    navigator: Methods
 
 
 class OpenCVDetector:
@@ -136,12 +135,11 @@ def make_methods(args: Demo, world: RenderedWorld) -> tuple[Method, Method]:
     """
 
     def method(name: str, detectors: Sequence[Detector], selector: str) -> Method:
-        navigators = {name: world.navigator(selector)}
-        return Method(
-            name, detectors, Methods(navigators, lambda one: compiled_step(one, step_folder()))
-        )
+        alone = {name: world.navigator(selector)}
+        methods = Methods(alone, lambda navigator: compiled_step(navigator, step_folder()))
+        return Method(name, detectors, methods)
 
-    markers: MarkerMap = world.setup.markers
+    markers = world.setup.markers
     opencv = [OpenCVDetector(family) for family in sorted(set(markers.families))]
     return (
         method(OURS, make_detectors(markers, args.corner_backend), args.selector),
@@ -193,18 +191,15 @@ def drive_both(args: Demo, world: RenderedWorld, ours: Method, opencv: Method, s
     opencv.navigator.reset()
 
     def listen(frame: DriveFrame, images: list[np.ndarray]) -> None:
-        corners_px, visible, sigma_px = ears.search(images, None)
+        corners_px, visible, sigma_px = (jnp.asarray(one) for one in ears.search(images, None))
         observation = replace(
-            frame.observation,
-            corners_px=jnp.asarray(corners_px, float),
-            visible=jnp.asarray(visible),
-            corner_sigma_px=jnp.asarray(sigma_px, float),
+            frame.observation, corners_px=corners_px, visible=visible, corner_sigma_px=sigma_px
         )
         outputs, branches = opencv.navigator.step(observation, jnp.asarray(frame.true_pose))
         heard.append(replace(frame, observation=observation, outputs=outputs, branches=branches))
 
-    ours_driven = _drive(args, world, ours, seed, listen)
-    driven = {OURS: ours_driven, OPENCV: _drive(args, world, opencv, seed)}
+    driven = {OURS: _drive(args, world, ours, seed, listen)}
+    driven[OPENCV] = _drive(args, world, opencv, seed)
     return Drives(driven, Record(OPENCV, heard))
 
 
@@ -312,29 +307,21 @@ def _score(world: RenderedWorld, record: Record) -> dict[str, float]:
 
 def overall(summaries: list[dict[str, Any]]) -> dict[str, Any]:
     """What summary.json says of several seeds: counts, and medians over them."""
-    return {
-        "runs": len(summaries),
-        "methods": {
-            name: _together([summary["drives"][name] for summary in summaries])
-            for name in (OURS, OPENCV)
-        },
-        "alongside": _medians([summary["alongside"] for summary in summaries]),
-        "seeds": summaries,
-    }
 
+    def medians(scores: list[dict[str, Any]]) -> dict[str, float]:
+        names = [name for name, score in scores[0].items() if isinstance(score, float)]
+        return {name: float(np.median([score[name] for score in scores])) for name in names}
 
-def _together(drives: list[dict[str, Any]]) -> dict[str, Any]:
-    scores = [{k: v for k, v in drive.items() if isinstance(v, float)} for drive in drives]
-    return {
-        "reached": sum(drive["reached"] for drive in drives),
-        "success_rate": np.mean([drive["reached"] for drive in drives]),
-        "once_lost": sum(drive["position_worst_m"] > LOST_M for drive in drives),
-        **_medians(scores),
-    }
-
-
-def _medians(scores: list[dict[str, float]]) -> dict[str, float]:
-    return {key: float(np.median([score[key] for score in scores])) for key in scores[0]}
+    methods = {}
+    for name in (OURS, OPENCV):
+        drives = [summary["drives"][name] for summary in summaries]
+        methods[name] = {
+            "reached": sum(drive["reached"] for drive in drives),
+            "success_rate": np.mean([drive["reached"] for drive in drives]),
+            "once_lost": sum(drive["position_worst_m"] > LOST_M for drive in drives),
+        } | medians(drives)
+    alongside = medians([summary["alongside"] for summary in summaries])
+    return {"runs": len(summaries), "methods": methods, "alongside": alongside, "seeds": summaries}
 
 
 def lines(summary: dict[str, Any]) -> list[str]:

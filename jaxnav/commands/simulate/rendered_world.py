@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from jaxnav.commands.reading import given_files
 from jaxnav.commands.simulate.arguments import Demo
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
@@ -18,15 +19,7 @@ from jaxnav.core.navigator import Navigator, Output
 from jaxnav.detection import Detections, Detector, Tracker, observe
 from jaxnav.detection.observe import marker_keys
 from jaxnav.errors import BadInput
-from jaxnav.files import (
-    Params,
-    calib_dir,
-    load_car,
-    load_markers,
-    load_params,
-    load_rig,
-    load_route,
-)
+from jaxnav.files import Params, calib_dir, load_car, load_params, load_route
 from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.sim.drive import DriveSettings, PoseAt
 from jaxnav.sim.rendering import Renderer
@@ -44,7 +37,7 @@ class RenderedWorld:
     """The objects of a demo, built from its files, with a renderer."""
 
     setup: DriveSetup  # without the parameters
-    vehicle: Vehicle  # its own
+    vehicle: Vehicle
     params: Params | None
     renderer: Renderer
     cameras: list[Camera]  # those of the rig, one by one
@@ -52,9 +45,8 @@ class RenderedWorld:
     @staticmethod
     def load(args: Demo) -> "RenderedWorld":
         """Read all files first, so that bad input is found before any work is done."""
-        qcar = calib_dir() / "qcar"
-        rig = load_rig(args.rig or qcar / "rig.yaml")
-        markers = load_markers(args.markers or qcar / "markers.yaml")
+        files = given_files(args, ("rig", "markers"), or_qcars=True)
+        rig, markers, qcar = files["rig"], files["markers"], calib_dir() / "qcar"
         rows = max(height for _, height in rig.image_sizes_px)
         shutter = Shutter(
             exposure_s=args.exposure_ms / 1e3 if args.blur else 0.0,

@@ -1,8 +1,10 @@
-"""`jaxnav simulate`: statistics of many closed-loop drives at corner level."""
+"""`jaxnav simulate`: statistics of many closed-loop drives at corner level; and the car that drives
+in scenarios, which `tune` has too."""
 
 import itertools
 import math
 from contextlib import nullcontext
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import equinox as eqx
@@ -12,18 +14,26 @@ from pydantic import Field
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
+from jaxnav.commands.reading import given_files
+from jaxnav.commands.simulate.arguments import ScenarioCarFiles
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
-from jaxnav.commands.simulate.scenario_car import ScenarioCar
+from jaxnav.core.filter.choose import Selector
+from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.filter.selectors import SELECTORS, make_selector
-from jaxnav.core.models.vehicle import TwistBase
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput
-from jaxnav.files import limits, load_params, write_json
+from jaxnav.files import Params, Route, apply_params, limits, load_params, load_route, write_json
 from jaxnav.files.reading import parse_json, read_text
 from jaxnav.files.validation import ForeignEntry, validate
 from jaxnav.files.writing import plain_data, sole_writer
+from jaxnav.sim.bases import equipped
+from jaxnav.sim.corners import see
 from jaxnav.sim.rollout import Rollout
-from jaxnav.sim.scenarios import Scenario, on_laps
+from jaxnav.sim.scenarios import Scenario, on_laps, on_route, scenarios
 from jaxnav.sim.scores import Drives
 
 _FILES = "rig", "markers", "vehicle", "route", "params"
@@ -31,34 +41,98 @@ _FILES = "rig", "markers", "vehicle", "route", "params"
 _OLDER = {"params": None, "laps": 0, "base": "ackermann", "imu": "none", "route": None}
 
 
+@dataclass(frozen=True)
+class ScenarioCar:
+    """The rig, markers, vehicle, parameters and route that all scenarios share.
+
+    Attributes:
+        route: in the map's coordinates; None where each scenario drives its own.
+    """
+
+    rig: CameraRig
+    markers: MarkerMap
+    vehicle: Vehicle | TwistBase
+    params: Params | None
+    route: Route | None = None
+
+    @staticmethod
+    def load(files: ScenarioCarFiles, params: Params | None = None) -> "ScenarioCar":
+        """Load a car from its files.
+
+        Raises:
+            BadInput: a file that is not valid.
+        """
+        content = given_files(files, ("rig", "markers", "vehicle"), or_qcars=True)
+        vehicle = equipped(content.pop("vehicle"), files.base, files.imu)
+        route = None
+        if files.route is not None:
+            route = load_route(files.route).relative_to(content["markers"].origin_m)
+        return ScenarioCar(**content, vehicle=vehicle, params=params, route=route)
+
+    def scenario(self, name: str) -> Scenario:
+        """A scenario by its name, on this car's route if it has one.
+
+        Raises:
+            BadInput: no camera sees a marker of the map from its start, where nothing would come
+                of it: its own route is one before the QCar's marker.
+        """
+        scenario = scenarios()[name]
+        if self.route is not None:
+            scenario = on_route(scenario, self.route.waypoints_m, self.route.start_pose)
+        start = jnp.asarray(scenario.start_pose, self.rig.cameras.focal_px.dtype)
+        _, visible = jax.jit(see)(self.rig, self.markers, T_world_vehicle_from_planar(start))
+        if not visible.any():
+            whose = "it"
+            if self.route is None:
+                whose = f"the QCar's route of {name}: give one before your markers"
+            raise BadInput("--route", f"no marker of the map is in view from the start of {whose}")
+        return scenario
+
+    def navigator(self, scenario: Scenario, selector: Selector) -> Navigator:
+        """The navigator for a scenario; parameters override what the scenario tells.
+
+        Raises:
+            BadInput: a parameter that does not fit it.
+        """
+        navigator = Navigator(
+            rig=self.rig,
+            markers=self.markers,
+            vehicle=self.vehicle,
+            waypoints_m=scenario.waypoints_m,
+            selector=selector,
+            motion=BicycleKalman(
+                self.vehicle,
+                tilt_sigma_rad=scenario.told_tilt_sigma_rad,
+                height_sigma_m=scenario.told_height_sigma_m,
+            ),
+        )
+        return navigator if self.params is None else apply_params(navigator, self.params)
+
+
 def run(args: Arguments) -> int:
     """Drive every combination of selector and noise; print a table, and keep the numbers."""
     with nullcontext() if args.json is None else sole_writer(args.json):
-        return _run(args)
-
-
-def _run(args: Arguments) -> int:
-    configure_jax(float64=False)
-    collect_garbage_rarely()
-    names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
-    wanted = list(itertools.product(names, args.corner_noise_px))
-    done = _resumed(args)
-    params = None if args.params is None else load_params(args.params)
-    car = ScenarioCar.load(args, params)
-    scenario = _scenario(args, car)
-    if car.params is not None:
-        print(car.params.describe())
-    print(_header(scenario))
-    for name, noise_px in wanted:
-        key = _key(args, car, name, noise_px)
-        matches = [one for one in done if _OLDER | one["run"] == key]
-        result = matches[0] if matches else {"run": key} | _drive(args, car, scenario, key)
-        if not matches:
-            done.append(result)
-        if args.json is not None:
-            several = len(wanted) > 1 or len(done) > 1
-            write_json(args.json, {"runs": done} if several else result)
-        print(_row(result, scenario), flush=True)
+        configure_jax(float64=False)
+        collect_garbage_rarely()
+        names = list(SELECTORS) if "all" in args.selector else list(dict.fromkeys(args.selector))
+        wanted = list(itertools.product(names, args.corner_noise_px))
+        done = _resumed(args)
+        params = None if args.params is None else load_params(args.params)
+        car = ScenarioCar.load(args, params)
+        scenario = _scenario(args, car)
+        if car.params is not None:
+            print(car.params.describe())
+        print(_header(scenario))
+        for name, noise_px in wanted:
+            key = _key(args, car, name, noise_px)
+            matches = [one for one in done if _OLDER | one["run"] == key]
+            result = matches[0] if matches else {"run": key} | _drive(args, car, scenario, key)
+            if not matches:
+                done.append(result)
+            if args.json is not None:
+                several = len(wanted) > 1 or len(done) > 1
+                write_json(args.json, {"runs": done} if several else result)
+            print(_row(result, scenario), flush=True)
     return 0
 
 
@@ -91,12 +165,9 @@ def _drive(
     navigator = _navigator(car, scenario, name, key["told_noise_px"])
     rollout = Rollout(navigator, car.vehicle, car.markers, scenario, noise_px)
     with progress_bar(
-        total=args.seeds,
-        unit="drive",
-        desc=f"{name}, {noise_px} px",
-        disable=args.headless,
+        total=args.seeds, unit="drive", desc=f"{name}, {noise_px} px", disable=args.headless,
         leave=False,
-    ) as bar:
+    ) as bar:  # fmt: skip
         keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
         trace = rollout.run(keys, update_after_compiling(bar))
     return Drives.of(trace, scenario).summary()

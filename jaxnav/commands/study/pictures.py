@@ -7,9 +7,9 @@ from typing import Any
 import xarray as xr
 
 from jaxnav.commands.bars import progress_bar
+from jaxnav.commands.drive.arguments import Plot as Arguments
 from jaxnav.commands.report import save_figure
-from jaxnav.commands.study.arguments import Plot as Arguments
-from jaxnav.commands.study.studies import summary_of
+from jaxnav.commands.study.study import summary_of
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder, write_json
 from jaxnav.pictures.study import numeric_axes, study_curves, study_map, study_reliability
@@ -19,26 +19,10 @@ MAPS = {
     "drive": ("success_rate", "flip_rate", "position_error_m_median"),
 }
 CURVES = {
-    "ambiguity": (
-        "flip_rate",
-        "success_rate",
-        "declined_rate",
-        "position_error_m_median",
-        "rotation_error_deg_median",
-        "error_ratio_median",
-        "nees_mean",
-        "lm_steps_median",
-    ),
-    "drive": (
-        "success_rate",
-        "flip_rate",
-        "duration_s_median",
-        "time_to_decide_s_median",
-        "position_error_m_median",
-        "rotation_error_deg_median",
-        "nees_median",
-        "lm_steps_median",
-    ),
+    "ambiguity": "flip_rate success_rate declined_rate position_error_m_median "
+    "rotation_error_deg_median error_ratio_median nees_mean lm_steps_median".split(),
+    "drive": "success_rate flip_rate duration_s_median time_to_decide_s_median "
+    "position_error_m_median rotation_error_deg_median nees_median lm_steps_median".split(),
 }
 _MIN_MAP = 3  # values along either axis, for a map to be worth looking at
 _MAX_PICTURES = 24  # of one sort

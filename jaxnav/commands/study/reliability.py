@@ -7,7 +7,7 @@ import numpy as np
 from jaxnav.commands.bars import progress_bar
 from jaxnav.commands.process import configure_jax
 from jaxnav.commands.report import write_report
-from jaxnav.commands.study.arguments import StudyReliability as Arguments
+from jaxnav.commands.simulate.arguments import StudyReliability as Arguments
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import output_folder

@@ -2,17 +2,17 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Key
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
-from jaxnav.commands.simulate.scenario_car import ScenarioCar
-from jaxnav.commands.tune.arguments import TuneController as Arguments
+from jaxnav.commands.simulate.arguments import TuneController as Arguments
+from jaxnav.commands.simulate.simulate import ScenarioCar
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.models.vehicle import TwistBase
@@ -22,17 +22,15 @@ from jaxnav.errors import BadInput
 from jaxnav.experiments.tuning.descent import Noisy
 from jaxnav.experiments.tuning.drive_loss import DriveLoss
 from jaxnav.experiments.tuning.driving import ClosedLoop
-from jaxnav.experiments.tuning.fit import ControllerScores, Problem, TuningFit
+from jaxnav.experiments.tuning.fit import ControllerScores, Problem
 from jaxnav.experiments.tuning.objective import Batch, NotFinite
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import Params, load_params, output_folder
+from jaxnav.pictures.tuning import controller_report
 from jaxnav.sim.rollout import Rollout
 from jaxnav.sim.scores import Drives
 from jaxnav.sim.statistics import bootstrap_mean, wilson_interval
 from jaxnav.sim.world import Spread
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _CAR = (
     "controller.proportional_per_m",
@@ -54,25 +52,24 @@ def run(args: Arguments) -> int:
     configure_jax(float64=False)
     collect_garbage_rarely()
     params = None if args.params is None else load_params(args.params)
-    loop, *tests = (closed_loop(args, name, params) for name in (args.scenario, *_tests(args)))
+    loop = closed_loop(args, args.scenario, params)
+    tests: dict[str, ClosedLoop] = {
+        name: closed_loop(args, name, params) for name in args.test_scenario
+    }
     navigator = loop.rollout.navigator
-    space = gains_of(args, navigator)
-    gains = Gains(args, loop, dict(zip(_tests(args), tests, strict=True)), space)
-    out = output_folder(args.out)
+    space, known = gains_of(args, navigator), parameters_of(navigator)
+    before = {name: known[name] for name in space.free}
     key = plain_key("tune controller", args)
+    problem, out = _problem(args, loop, space), output_folder(args.out)
     return run_fit(
-        Fitting(out, key, gains.problem(), space, named=args.train),
+        Fitting(out, key, problem, space, named=args.train),
         args.headless,
-        before=gains.before,
-        test=gains.test,
+        before=before,
+        test=lambda fit: _tested(args, tests, before, space.values(fit.best_x)),
         as_json=_as_json,
-        draw=_draw,
+        draw=controller_report,
         text=_text,
     )
-
-
-def _tests(args: Arguments) -> list[str]:
-    return list(dict.fromkeys(args.test_scenario))
 
 
 def closed_loop(args: Arguments, name: str, params: Params | None = None) -> ClosedLoop:
@@ -115,115 +112,95 @@ def _by_default(navigator: Navigator) -> tuple[str, ...]:
     return _BASE if vehicle.left_limit_mps > 0 else (*_BASE, *_ON_THE_SPOT)
 
 
-class Gains:
-    """The loss of simulated drives as a problem for a fit, and tests of its result."""
+def _problem(args: Arguments, loop: ClosedLoop, space: Space) -> Problem:
+    """The loss of simulated drives: new seeds in every step, the same seeds held out."""
+    begin, end = _SOFTNESS_M
 
-    def __init__(
-        self, args: Arguments, loop: ClosedLoop, tests: dict[str, ClosedLoop], space: Space
-    ):
-        self._args, self._loop, self._tests, self._space = args, loop, tests, space
+    def gradients(x: Array, batch: Batch, softness: Array) -> tuple[ClosedLoop, Array, Array]:
+        """The soft loop of a step, and the loss of each of its drives with its gradient."""
+        soft = dataclasses.replace(loop, softness_m=softness)
+        keys = _keys(args.seed + batch.items * args.seeds, args.seeds)
+        return soft, *soft.value_and_grad(x, space, keys)
 
-    @property
-    def before(self) -> dict[str, Float[Array, "..."]]:
-        """The values of the gains before they are learned."""
-        known = parameters_of(self._loop.rollout.navigator)
-        return {name: known[name] for name in self._space.free}
+    def evaluate(x: Array, batch: Batch, softness: Array) -> tuple[Array, Array]:
+        _, losses, slopes = gradients(x, batch, softness)
+        return jnp.mean(losses), jnp.mean(slopes, axis=0)
 
-    def problem(self) -> Problem:
-        """The problem of the fit: new seeds in every step, the same seeds held out."""
-        args = self._args
-        return Problem(
-            optimiser=Noisy(self._evaluate, args.learning_rate, args.steps),
-            batch=lambda x, stage, step: Batch(step, jnp.ones(())),
-            held_out=lambda x, stage_x, stage: self._held_out(x),
-            softness=self._softness,
-            explain=self._explain,
-            steps=args.steps,
-            patience=max(10, args.steps // 3),
-            same_batch=False,
-        )
-
-    def test(self, fit: TuningFit) -> dict[str, tuple[ControllerScores, ControllerScores]]:
-        """Test results before and after the fit, by scenario.
-
-        Both pass their gains as arrays, so that one program drives with either.
-        """
-        count = self._args.test_seeds
-        with progress_bar(
-            total=2 * count * len(self._tests),
-            unit="drive",
-            desc="test",
-            disable=self._args.headless,
-            leave=False,
-        ) as bar:
-            return {
-                name: (
-                    self._test(loop, self.before, update_after_compiling(bar)),
-                    self._test(loop, self._space.values(fit.best_x), bar.update),
-                )
-                for name, loop in self._tests.items()
-            }
-
-    def _softness(self, step: int) -> float:
-        begin, end = _SOFTNESS_M
-        return float(begin * (end / begin) ** min(1.0, step / max(1, self._args.steps - 1)))
-
-    def _training(self, step: int) -> Key[Array, " S"]:
-        return _keys(self._args.seed + step * self._args.seeds, self._args.seeds)
-
-    def _evaluate(self, x: Array, batch: Batch, softness: Array) -> tuple[Array, Array]:
-        """The mean loss of a step's drives, and its gradient."""
-        soft = dataclasses.replace(self._loop, softness_m=softness)
-        losses, gradients = soft.value_and_grad(x, self._space, self._training(batch.items))
-        return jnp.mean(losses), jnp.mean(gradients, axis=0)
-
-    def _explain(self, x: Array, batch: Batch, softness: Array) -> NotFinite | None:
-        keys = self._training(batch.items)
-        soft = dataclasses.replace(self._loop, softness_m=softness)
-        broken = ~np.isfinite(np.asarray(soft.value_and_grad(x, self._space, keys)[1]))
+    def explain(x: Array, batch: Batch, softness: Array) -> NotFinite | None:
+        soft, _, slopes = gradients(x, batch, softness)
+        broken = ~np.isfinite(np.asarray(slopes))
         if not broken.any():
             return None
         item = int(np.argmax(broken.any(axis=1)))
-        frame = soft.first_not_finite(x, self._space, keys[item])
-        return NotFinite(int(np.argmax(broken[item])), item, frame)
+        key = _keys(args.seed + batch.items * args.seeds, args.seeds)[item]
+        return NotFinite(int(np.argmax(broken[item])), item, soft.first_not_finite(x, space, key))
 
-    def _held_out(self, x: Array) -> float:
-        keys = _keys(_HELD_OUT_SEED, self._args.held_out_seeds)
-        return float(np.mean(self._loop.hard_losses(x, self._space, keys)))
+    def held_out(x: Array, stage_x: Array, stage: int) -> float:
+        keys = _keys(_HELD_OUT_SEED, args.held_out_seeds)
+        return float(np.mean(loop.hard_losses(x, space, keys)))
 
-    def _test(
-        self, loop: ClosedLoop, values: Mapping[str, Array], progress: Callable[[int], object]
-    ) -> ControllerScores:
-        """Drive with the scenario's own car: only what the seed draws is random."""
-        nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
-        keys = _keys(_TEST_SEED, self._args.test_seeds)
-        losses, costs, trace = nominal.value(values, keys, progress)
-        once = np.ones(len(losses))
-        success = Drives.of(trace, loop.rollout.scenario).success
-        rate = float(np.mean(success))
-        low, high = wilson_interval(np.array(rate), np.array(len(success)))
-        own = np.asarray(trace.active)[0]
-        return ControllerScores(
-            loss=bootstrap_mean(losses, once),
-            parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
-            time_s=bootstrap_mean(np.asarray(costs.time_s), once),
-            success=(rate, float(low), float(high)),
-            poses=np.asarray(trace.true_pose)[0][own],
-            waypoints_m=np.asarray(loop.rollout.scenario.waypoints_m),
-        )
+    return Problem(
+        optimiser=Noisy(evaluate, args.learning_rate, args.steps),
+        batch=lambda x, stage, step: Batch(step, jnp.ones(())),
+        held_out=held_out,
+        softness=lambda step: begin * (end / begin) ** min(1.0, step / max(1, args.steps - 1)),
+        explain=explain,
+        steps=args.steps,
+        patience=max(10, args.steps // 3),
+        same_batch=False,
+    )
+
+
+def _tested(
+    args: Arguments,
+    tests: dict[str, ClosedLoop],
+    before: Mapping[str, Array],
+    after: Mapping[str, Array],
+) -> dict[str, tuple[ControllerScores, ControllerScores]]:
+    """Test results before and after the fit, by scenario.
+
+    Both pass their gains as arrays, so that one program drives with either.
+    """
+    with progress_bar(
+        total=2 * args.test_seeds * len(tests), unit="drive", desc="test", disable=args.headless,
+        leave=False,
+    ) as bar:  # fmt: skip
+        return {
+            name: (
+                _test(loop, args.test_seeds, before, update_after_compiling(bar)),
+                _test(loop, args.test_seeds, after, bar.update),
+            )
+            for name, loop in tests.items()
+        }
+
+
+def _test(
+    loop: ClosedLoop,
+    count: int,
+    values: Mapping[str, Array],
+    progress: Callable[[int], object],
+) -> ControllerScores:
+    """Drive with the scenario's own car: only what the seed draws is random."""
+    nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
+    losses, costs, trace = nominal.value(values, _keys(_TEST_SEED, count), progress)
+    once = np.ones(len(losses))
+    success = Drives.of(trace, loop.rollout.scenario).success
+    rate = float(np.mean(success))
+    low, high = wilson_interval(np.array(rate), np.array(len(success)))
+    own = np.asarray(trace.active)[0]
+    return ControllerScores(
+        loss=bootstrap_mean(losses, once),
+        parts={name: float(np.mean(p)) for name, p in loop.loss.parts(costs).items()},
+        time_s=bootstrap_mean(np.asarray(costs.time_s), once),
+        success=(rate, float(low), float(high)),
+        poses=np.asarray(trace.true_pose)[0][own],
+        waypoints_m=np.asarray(loop.rollout.scenario.waypoints_m),
+    )
 
 
 def _keys(first: int, count: int) -> Key[Array, " S"]:
     keys: Key[Array, " S"] = jax.vmap(jax.random.key)(first + jnp.arange(count))
     return keys
-
-
-def _draw(
-    fit: TuningFit, space: Space, judged: Mapping[str, tuple[ControllerScores, ControllerScores]]
-) -> "Figure":
-    from jaxnav.pictures.tuning import controller_report  # matplotlib
-
-    return controller_report(fit, space, judged)
 
 
 def _as_json(tested: ControllerScores) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """`jaxnav tune filter`: learn Q and R from recordings or simulated drives."""
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
-from jaxnav.commands.tune.arguments import TuneFilter as Arguments
+from jaxnav.commands.simulate.arguments import TuneFilter as Arguments
 from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.core.filter.hypotheses import MultiHypothesis
@@ -25,10 +25,8 @@ from jaxnav.experiments.tuning.objective import Batch, Objective, where_not_fini
 from jaxnav.experiments.tuning.recorded import FrameSequences
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import Params, apply_params, load_params, output_folder
+from jaxnav.pictures.tuning import tuning_report
 from jaxnav.sim.statistics import anees_band, bootstrap_mean
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _STAGES = 4
 
@@ -52,7 +50,7 @@ def run(args: Arguments) -> int:
         before=space.values(space.start),
         test=lambda fit: _tested(args, data, params, space, fit),
         as_json=_as_json,
-        draw=_draw,
+        draw=tuning_report,
         text=_text,
     )
 
@@ -162,14 +160,6 @@ def _test(
         error_m=np.sqrt(square_m2[judged]),
         indefinite=int(np.sum(judged & ~definite)),
     )
-
-
-def _draw(
-    fit: TuningFit, space: Space, judged: Mapping[str, tuple[EstimatorScores, EstimatorScores]]
-) -> "Figure":
-    from jaxnav.pictures.tuning import tuning_report  # matplotlib
-
-    return tuning_report(fit, space, judged)
 
 
 def _as_json(tested: EstimatorScores) -> dict[str, Any]:

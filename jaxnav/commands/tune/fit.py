@@ -8,6 +8,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -57,10 +58,11 @@ _DAMAGED = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True)
 class Fitting:
     """A fit that keeps its best parameters and a checkpoint in a folder.
 
-    Args:
+    Attributes:
         folder: of params.yaml and checkpoint.npz.
         key: all that the result depends on, plain values; a checkpoint of another key is refused.
         prior_sigma: see `Objective`; it decides parameters on which no drive depends.
@@ -68,19 +70,12 @@ class Fitting:
             for all.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        key: dict[str, Any],
-        problem: Problem,
-        space: Space,
-        prior_sigma: float = np.inf,
-        report: Callable[[str], object] = print,
-        named: Collection[str] | None = None,
-    ):
-        self.folder, self.key, self._problem = folder, key, problem
-        self.space, self._prior_sigma, self._report = space, prior_sigma, report
-        self._named = set(space.labels if named is None else named)
+    folder: Path
+    key: dict[str, Any]
+    problem: Problem
+    space: Space
+    prior_sigma: float = np.inf
+    named: Collection[str] | None = None
 
     @property
     def checkpoint(self) -> Path:
@@ -95,66 +90,61 @@ class Fitting:
                 parameter on which the loss doesn't depend.
             KeyboardInterrupt: the state reached is kept.
         """
-        with sole_writer(self.checkpoint):
-            return self._run(headless)
-
-    def _run(self, headless: bool) -> TuningFit:
-        with progress_bar(total=self._problem.steps, unit="step", disable=headless) as bar:
+        bars = progress_bar(total=self.problem.steps, unit="step", disable=headless)
+        with sole_writer(self.checkpoint), bars as bar:
             bar.set_postfix_str("compiling")
-            fit = TuningFit.begin(self.space.start, self._problem)
+            fit = TuningFit.begin(self.space.start, self.problem)
             kept = self._kept(fit)
             if kept is not None:
                 fit = kept
                 bar.clear()
-                self._report(f"{self.checkpoint}: going on after step {fit.step}")
+                print(f"{self.checkpoint}: going on after step {fit.step}")
                 bar.initial = bar.n = fit.step
                 bar.refresh()
             while not fit.over:
-                before, fit = fit, take_step(fit, self._problem)
+                before, fit = fit, take_step(fit, self.problem)
                 if fit.step == 1:
                     self._refuse_without_gradient(fit)
                 if not bool(fit.descent.finite):
                     bar.clear()
-                    self._report(self._where(before, fit.descent.asked_x))
+                    print(self._where(before, fit.descent.asked_x))
                 # Losses can't be compared here: another stage has other ones.
                 if fit.step == 1 or bool(jnp.any(fit.best_x != before.best_x)):
-                    self.write(fit)
+                    self._write(fit)
                 self._keep(fit)
                 bar.set_postfix_str(f"held out {fit.history[-1][1]:.5g}, best {fit.best_loss:.5g}")
                 bar.update(1)
         return fit
 
-    def write(self, fit: TuningFit) -> None:
+    def _write(self, fit: TuningFit) -> None:
         """Write the best parameters so far to params.yaml."""
         values = {name: np.asarray(value) for name, value in self.space.values(fit.best_x).items()}
-        write_params(self.folder / "params.yaml", values, self._provenance(fit))
-
-    def _provenance(self, fit: TuningFit) -> dict[str, Any]:
-        return self.key | {
+        provenance = self.key | {
             "step": fit.step,
             "held_out_loss": {"before": float(fit.history[0][1]), "after": fit.best_loss},
             "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         }
+        write_params(self.folder / "params.yaml", values, provenance)
 
     def _where(self, before: TuningFit, x: Array) -> str:
         """A message about a gradient at x that is not finite."""
         step = before.step
-        softness = jnp.asarray(self._problem.softness(step), x.dtype)
-        batch = self._problem.batch(before.stage_x, before.stage, step)
-        place = self._problem.explain(x, batch, softness)
+        softness = jnp.asarray(self.problem.softness(step), x.dtype)
+        batch = self.problem.batch(before.stage_x, before.stage, step)
+        place = self.problem.explain(x, batch, softness)
         if place is None:
             return f"step {step + 1}: the loss is not finite; not stepped on"
         return place.describe(self.space.labels, step + 1)
 
     def _refuse_without_gradient(self, fit: TuningFit) -> None:
         """Raise BadInput where the loss does not depend on a parameter at all."""
-        batch = self._problem.batch(fit.stage_x, 0, 0)
+        batch = self.problem.batch(fit.stage_x, 0, 0)
         x, slope = self.space.start, fit.descent.gradient
-        prior = x / self._prior_sigma**2 / batch.frames
+        prior = x / self.prior_sigma**2 / batch.frames
         of_frames = np.asarray(slope - prior)
         tiny = 1e-6 * np.maximum(np.abs(np.asarray(prior)), 1e-12)
         labels = np.array(self.space.labels)
-        for name in sorted(self._named):
+        for name in sorted(set(self.space.labels if self.named is None else self.named)):
             if np.all(np.abs(of_frames[labels == name]) <= tiny[labels == name]):
                 raise BadInput("--train", f"the loss does not depend on {name}")
 

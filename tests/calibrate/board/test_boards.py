@@ -13,9 +13,10 @@ from jaxnav import cli
 from jaxnav.calibrate.board.board import Board
 from jaxnav.calibrate.board.detection import look_at
 from jaxnav.calibrate.board.sheets import centre_mm, check_fit, largest, room_mm, sheet_of
-from jaxnav.commands.calibrate.board import read_board, write_board
+from jaxnav.commands.calibrate.board import read_board
 from jaxnav.detection.families import dictionary
 from jaxnav.errors import BadInput
+from jaxnav.files.boards import save_board
 
 CHARUCO = Board("charuco", 5, 4, 0.04, marker_m=0.03, family="4x4_50")
 APRILGRID = Board("aprilgrid", 3, 2, 0.08, spacing=0.3, family="tag36h11", border_cells=2)
@@ -129,7 +130,7 @@ def test_discs_are_numbered_as_opencv_does() -> None:
 
 @pytest.mark.parametrize("board", BOARDS + DISCS, ids=lambda board: board.kind)
 def test_a_file_gives_the_board_back(board: Board, tmp_path: Path) -> None:
-    write_board(tmp_path / "board.yaml", board)
+    save_board(tmp_path / "board.yaml", vars(board))
     assert read_board(tmp_path / "board.yaml") == board
 
 

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,11 +14,11 @@ from jaxnav.calibrate.lens import choice
 from jaxnav.calibrate.lens.intrinsics import calibrate_images
 from jaxnav.commands.calibrate import intrinsics as calibrate_intrinsics
 from jaxnav.commands.calibrate.arguments import CalibrateIntrinsics
-from jaxnav.commands.calibrate.board import write_board
 from jaxnav.commands.kinds import check_values
 from jaxnav.core.models.camera import Camera
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir, load_rig
+from jaxnav.files.boards import save_board
 from jaxnav.files.reading import read_mapping
 from tests.helpers.board_pictures import board_pictures
 
@@ -46,7 +45,7 @@ def rendered(folder, board, count, seed, camera=None, **how):
 def shots(tmp_path_factory):
     """A folder with board.yaml and front/."""
     folder = tmp_path_factory.mktemp("shots")
-    write_board(folder / "board.yaml", BOARD)
+    save_board(folder / "board.yaml", vars(BOARD))
     rendered(folder / "front", BOARD, VIEWS, seed=3)
     return folder
 
@@ -89,7 +88,7 @@ def test_rendered_images_of_another_wide_lens_tell_it(tmp_path):
     """In the file that `load_rig` and the other commands take."""
     lens, bent = "omni", [0.9, -0.05, 0.01, 1e-3, -5e-4]
     camera = Camera.create((606.0, 606.0), (401.0, 202.0), lens, bent)
-    write_board(tmp_path / "board.yaml", BOARD)
+    save_board(tmp_path / "board.yaml", vars(BOARD))
     rendered(tmp_path / "front", BOARD, VIEWS, seed=3, camera=camera)
     args = arguments(tmp_path, tmp_path / "out", f"front={tmp_path / 'front'}", lens=lens)
     assert calibrate_intrinsics.run(args) == 0
@@ -143,12 +142,12 @@ def test_a_marker_is_looked_at_again_with_the_lens_it_told(tmp_path, monkeypatch
 
 
 def fewer_rows(shots, folder):
-    write_board(folder / "board.yaml", replace(BOARD, rows=5))
+    save_board(folder / "board.yaml", vars(BOARD) | {"rows": 5})
     return shots / "front"
 
 
 def wider(shots, folder):
-    write_board(folder / "board.yaml", replace(BOARD, columns=8))
+    save_board(folder / "board.yaml", vars(BOARD) | {"columns": 8})
     return shots / "front"
 
 

@@ -11,7 +11,7 @@ import yaml
 from jaxnav.calibrate.odometry.drive import Drive
 from jaxnav.calibrate.odometry.model import NAMES
 from jaxnav.cli import main
-from jaxnav.commands.calibrate.odometry_recordings import drive_of
+from jaxnav.commands.calibrate.odometry import drive_of
 from jaxnav.detection import Detections
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Odometry
@@ -23,12 +23,6 @@ from jaxnav.recordings.records import input_message
 from tests import worlds
 from tests.helpers.odometry_drives import RECIPE, START, TRUTH, sensed, true_track
 from tests.helpers.simulated import make_setup
-
-
-@pytest.fixture(autouse=True)
-def keep_the_settings_of_jax(monkeypatch):
-    """Commands choose a precision and a cache of their own; tests keep theirs."""
-    monkeypatch.setattr("jaxnav.commands.calibrate.odometry.configure_jax", lambda float64: None)
 
 
 def sensed_drive(seed: int = 0) -> Drive:

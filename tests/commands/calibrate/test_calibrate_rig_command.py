@@ -11,9 +11,7 @@ import yaml
 
 from jaxnav import cli
 from jaxnav.calibrate.rig.views import Ts_vehicle_camera, turn_rad
-from jaxnav.commands.calibrate import check as calibrate_check
-from jaxnav.commands.calibrate import rig as calibrate_rig
-from jaxnav.commands.calibrate.rig_results import coverage
+from jaxnav.commands.calibrate.rig_data import coverage
 from jaxnav.detection.types import Detections
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Odometry
@@ -27,12 +25,6 @@ from tests.helpers.setups import setup_with
 from tests.helpers.simulated import ROUTE
 
 FRAMES, PERIOD_NS = 120, 50_000_000
-
-
-@pytest.fixture(autouse=True)
-def _as_it_is(monkeypatch) -> None:
-    for command in (calibrate_rig, calibrate_check):
-        monkeypatch.setattr(command, "configure_jax", lambda float64: None)
 
 
 @pytest.fixture(scope="module")

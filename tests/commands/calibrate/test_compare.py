@@ -3,18 +3,12 @@
 import json
 
 import cv2
-import pytest
 import yaml
 
 from jaxnav.cli import main
 from jaxnav.files import calib_dir
 
 RIG = calib_dir() / "qcar" / "rig.yaml"
-
-
-@pytest.fixture(autouse=True)
-def keep_the_compile_cache(monkeypatch):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
 
 
 def changed(tmp_path, change):

@@ -12,9 +12,9 @@ import pytest
 
 from jaxnav import cli
 from jaxnav.commands.drive.arguments import Run
-from jaxnav.commands.drive.delay_watch import DelayWatch
 from jaxnav.commands.drive.observers import (
     WIDTH,
+    DelayWatch,
     DriveRecorder,
     ExposureWatch,
     LearntWatch,
@@ -129,7 +129,6 @@ def test_a_missing_rerun_gets_one_line_before_anything_is_compiled(monkeypatch, 
     def compiles(self, folder):
         raise AssertionError("compiled")
 
-    monkeypatch.setattr("jaxnav.commands.drive.run.configure_jax", lambda float64, threads: None)
     monkeypatch.setattr(DriveSetup, "pilot", compiles)
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert cli.main(["run", "--view"]) == cli.EXIT_BAD_INPUT

@@ -39,12 +39,6 @@ TRAJECTORIES = (
 )
 
 
-@pytest.fixture(autouse=True)
-def keep_the_compile_cache(monkeypatch):
-    """Commands choose a cache of their own; tests keep theirs."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
-
-
 def test_both_methods_drive_from_images_and_one_listens(tmp_path, capsys, monkeypatch):
     """What people use otherwise drives by itself, and hears the images of our drive."""
     made = {}

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.commands.kinds import Scenario, Selector, SimulatedSelector
+from jaxnav.commands.kinds import Selector, SimulatedSelector
+from jaxnav.commands.simulate.arguments import Scenario
 from jaxnav.commands.simulate.arguments import Simulate as Arguments
-from jaxnav.commands.simulate.scenario_car import ScenarioCar
-from jaxnav.commands.simulate.simulate import _navigator
+from jaxnav.commands.simulate.simulate import ScenarioCar, _navigator
 from jaxnav.core.filter.selectors import SELECTORS
 from jaxnav.core.parameters import parameters_of
 from jaxnav.files import load_params, write_params
@@ -22,14 +22,6 @@ from jaxnav.sim.statistics import Reliability
 from tests.helpers.strangers import jaxnav
 
 SCENARIO = scenarios()["paper"]
-
-
-@pytest.fixture(autouse=True)
-def keep_the_settings_of_jax(monkeypatch):
-    """Commands choose a precision and a cache of their own; tests keep theirs."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "kept")
-    monkeypatch.setattr("jaxnav.commands.simulate.simulate.configure_jax", lambda float64: None)
-    monkeypatch.setattr("jaxnav.commands.study.reliability.configure_jax", lambda float64: None)
 
 
 def trace(drives=4, frames=60, **changes) -> Trace:
@@ -63,24 +55,19 @@ def test_perfect_drives():
     assert summary["anees"]["value"] == pytest.approx(3)
 
 
-def test_wrong_headings_are_counted_where_they_are():
-    pose = np.zeros((4, 60, 3))
+def test_wrong_headings_and_failures_are_counted_where_they_are():
+    pose, on_floor, passed = np.zeros((4, 60, 3)), np.ones((4, 60), bool), np.full((4, 60), 2)
     pose[0, :45, 2] = np.deg2rad(21.0)  # decided from 5, late from 30
     pose[1, :, 2] = 2 * np.pi + np.deg2rad(19.0)
-    summary = Drives.of(trace(pose=pose), SCENARIO).summary()
+    on_floor[0, 50:] = False  # it has left the floor
+    passed[1] = 1  # it falls short of a waypoint
+    drives = trace(pose=pose, on_floor=on_floor, passed=passed)
+    summary = Drives.of(drives, SCENARIO).summary()
     assert summary["wrong_branch_fraction"]["value"] == pytest.approx(45 / 240)
     assert summary["wrong_branch_fraction_after_2s"]["value"] == pytest.approx(15 / 120)
     assert summary["wrong_once_decided_fraction"]["value"] == pytest.approx(40 / 220)
     low, high = summary["wrong_branch_fraction"]["interval"]
     assert low <= 45 / 240 <= high
-
-
-def test_a_drive_off_the_floor_or_short_of_a_waypoint_has_failed():
-    on_floor = np.ones((4, 60), bool)
-    on_floor[0, 50:] = False
-    passed = np.full((4, 60), 2)
-    passed[1] = 1
-    summary = Drives.of(trace(on_floor=on_floor, passed=passed), SCENARIO).summary()
     assert summary["success_rate"]["value"] == 0.5
 
 
@@ -187,15 +174,6 @@ def test_a_name_without_a_gate_is_its_rule_on_a_filter_that_has_none():
         assert gates == [pytest.approx(21.1), np.inf]
 
 
-def test_every_scenario_can_be_named(capsys):
-    assert set(get_args(Scenario)) == set(scenarios())
-    assert main(["simulate", "--help"]) == 0
-    help_text = capsys.readouterr().out
-    for name in ("late", "drifting-corners", "each-camera-off", "uneven-wheels", "everything"):
-        assert name in help_text
-    assert "--laps" in help_text
-
-
 @pytest.mark.long
 def test_laps_are_driven_and_their_later_errors_shown(tmp_path, capsys):
     file = tmp_path / "s.json"
@@ -251,12 +229,6 @@ def kept(tmp_path, capsys, change=lambda result: None) -> tuple[int, str, str]:
     return code, told.out, told.err
 
 
-def test_numbers_that_are_missing_are_kept(tmp_path, capsys):
-    code, out, _ = kept(tmp_path, capsys)
-    assert code == 0
-    assert out.splitlines()[-1] == "| oracle | 1 | nan% | nan% | nan / nan | nan% | nan | nan |"
-
-
 def test_all_selectors_have_a_row_and_a_name_on_the_command_line(capsys, monkeypatch):
     def drive(_args, _car, _scenario, key: dict) -> dict:
         missing = {"value": None}
@@ -271,14 +243,23 @@ def test_all_selectors_have_a_row_and_a_name_on_the_command_line(capsys, monkeyp
     assert {"paper-cost-ungated", "lowest-reprojection-ungated"} < set(rows)
     assert {*get_args(SimulatedSelector)} == {*rows, "all"}
     assert {*get_args(Selector)} == {*PILOT_SELECTORS}
+    assert {*get_args(Scenario)} == {*scenarios()}
 
 
-def test_a_result_that_lacks_something_is_not_resumed(tmp_path, capsys):
-    code, _, err = kept(tmp_path, capsys, lambda result: result.pop("anees"))
-    assert (code, err.count("\n")) == (2, 1)
-    assert "s.json: runs[0].anees: missing" in err
-    code, _, err = kept(tmp_path, capsys, lambda result: result.update(anees={"value": "3"}))
-    assert "s.json: runs[0].anees.value: must be a number, got the text '3'" in err
+def test_what_is_missing_is_kept_and_what_lacks_something_not_resumed(tmp_path, capsys):
+    code, out, _ = kept(tmp_path, capsys)
+    assert code == 0
+    assert out.splitlines()[-1] == "| oracle | 1 | nan% | nan% | nan / nan | nan% | nan | nan |"
+    for change, told in (
+        (lambda result: result.pop("anees"), "anees: missing"),
+        (
+            lambda result: result.update(anees={"value": "3"}),
+            "anees.value: must be a number, got the text '3'",
+        ),
+    ):
+        code, _, err = kept(tmp_path, capsys, change)
+        assert (code, err.count("\n")) == (2, 1)
+        assert f"s.json: runs[0].{told}" in err
 
 
 @pytest.mark.parametrize(

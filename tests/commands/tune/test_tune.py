@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 
 from jaxnav.cli import main
-from jaxnav.commands.tune.arguments import TuneController, TuneFilter
+from jaxnav.commands.simulate.arguments import TuneController, TuneFilter
 from jaxnav.commands.tune.controller import closed_loop, gains_of
 from jaxnav.commands.tune.filter import space_of
 from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.experiments.tuning.drive_loss import DriveLoss
 from jaxnav.files import load_params
-
-
-@pytest.fixture(autouse=True)
-def keep_the_settings_of_jax(monkeypatch):
-    """Commands choose a precision and a cache of their own; tests keep theirs."""
-    for command in ("filter", "controller"):
-        name = f"jaxnav.commands.tune.{command}.configure_jax"
-        monkeypatch.setattr(name, lambda float64: None)
 
 
 def told(capsys, *arguments: str) -> str:

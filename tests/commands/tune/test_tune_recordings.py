@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from jaxnav.commands.tune.sequences import (
+from jaxnav.commands.tune.data import (
     GAP_S,
     NamedSequences,
     join_sequences,

@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 
 from jaxnav.cli import main
-from jaxnav.commands.study.studies import load_study, shipped_configs
+from jaxnav.commands.study.study import load_study, shipped_configs
 from jaxnav.core.filter.selectors import SELECTORS
 from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.markers import CORNER_SIGNS

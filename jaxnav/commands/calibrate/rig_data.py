@@ -1,6 +1,8 @@
-"""Results of `jaxnav calibrate rig`, `markers` and `check`: files, numbers, advice."""
+"""What `jaxnav calibrate rig`, `markers` and `check` read and write: sightings and known markers;
+files, numbers and advice."""
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,24 +15,161 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration
-from jaxnav.calibrate.rig.views import Ts_vehicle_camera, inverted, turn_rad
-from jaxnav.commands.calibrate.data import RigData
-from jaxnav.commands.calibrate.report import provenance
+from jaxnav.calibrate.rig.views import RigViews, Ts_vehicle_camera, inverted, turn_rad
+from jaxnav.commands.calibrate.arguments import CalibrateCheck, CalibrateMarkers, CalibrateRig
+from jaxnav.commands.reading import given_files
+from jaxnav.commands.report import provenance
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
-from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.origin import poses_in_world
+from jaxnav.core.models.rig import CameraRig
+from jaxnav.detection.observe import marker_keys
+from jaxnav.errors import BadInput
 from jaxnav.files import save_markers, save_rig, write_tum
 from jaxnav.files.markers import MarkerSigma, marker_map
 from jaxnav.files.poses import pose_from_matrix
 from jaxnav.files.provenance import Calibrated
 from jaxnav.files.rigs import CameraSigma
+from jaxnav.recordings.other.recordings import RecordedSightings, read_sightings
 
+_LEAST_SIGHTINGS = 3  # of a marker that is in no map
+_APART_NS = 10**12  # between recordings
+_MOST_LISTED = 12
 # Good enough for driving: half a degree moves the car 3 cm sideways at 3 m from a marker.
 _WELL_M, _WELL_DEG = 0.005, 0.2
 _MANY_OUTLIERS = 0.2
 _FEW_SIGHTINGS = 30
 _CELLS = 8
 _LITTLE_SEEN = 0.25  # of a camera's image
+
+MarkerKey = tuple[str, int]  # family, id
+
+
+@dataclass(frozen=True)
+class RigData:
+    """Sightings of several recordings, with their rig and the known markers.
+
+    Attributes:
+        markers: the map, given or recorded, with markers that no camera saw; None without one.
+        keys: (M,) family and id of each marker, in the order of `views`.
+        known: T_world_marker (4, 4) of the known markers, by their index.
+        parts: the sightings of each recording.
+        anchored: whether a file or a recording knew a marker; if none did, one is the world.
+    """
+
+    rig: CameraRig
+    views: RigViews
+    markers: MarkerMap | None
+    keys: tuple[MarkerKey, ...]
+    known: dict[int, Float[np.ndarray, "4 4"]]
+    parts: tuple[RecordedSightings, ...]
+    anchored: bool
+
+
+def read_rig_data(
+    args: CalibrateRig | CalibrateMarkers | CalibrateCheck,
+    marker_size_m: float | None = None,
+    only_known: bool = False,
+) -> RigData:
+    """Read all recordings and join their sightings, one recording after the other.
+
+    Args:
+        marker_size_m: side of the markers that are in no map.
+        only_known: whether to leave these out.
+
+    Raises:
+        BadInput: names the file or the flag.
+    """
+    recordings, family = args.recordings, args.family
+    if family is not None and family not in FAMILY_SIZES:
+        raise BadInput("--family", f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
+    given = given_files(args, ("rig", "markers"))
+    markers = given.get("markers")
+    parts = [read_sightings(path, given.get("rig")) for path in recordings]
+    for part, path in zip(parts[1:], recordings[1:], strict=True):
+        if part.rig.names != parts[0].rig.names:
+            problem = f"its cameras are not those of {recordings[0]}: give one --rig for all"
+            raise BadInput(path, problem)
+    if markers is None:
+        markers = next((part.markers for part in parts if part.markers is not None), None)
+    if family is None:
+        of_map = set() if markers is None else set(markers.families)
+        family = of_map.pop() if len(of_map) == 1 else "tag36h11"
+    seen_keys = [key for part in parts for key in _keys(part, family)]
+    seen, mapped = Counter(seen_keys), () if markers is None else marker_keys(markers)
+    # An id that is seen more rarely is another pattern, taken for a marker.
+    often = {key for key, count in seen.items() if count >= _LEAST_SIGHTINGS and not only_known}
+    keys = tuple(sorted(key for key in seen if key in mapped or key in often))
+    if not keys:
+        what = "a marker of the map" if only_known else "a marker often enough"
+        raise BadInput(", ".join(map(str, recordings)), f"no camera saw {what}")
+    index_of = {key: index for index, key in enumerate(keys)}
+    known, sizes_m = _known(markers, keys, marker_size_m)
+    anchored = bool(known)
+    if not known:
+        if markers is not None:
+            ids = [marker_id for _, marker_id in keys]
+            more = ", ..." if len(ids) > _MOST_LISTED else ""
+            problem = (
+                f"none of its markers ({', '.join(map(str, markers.ids))}) was seen; seen were "
+                f"{', '.join(map(str, ids[:_MOST_LISTED]))}{more}"
+            )
+            raise BadInput(args.markers or "--markers", problem)
+        known = {index_of[seen.most_common(1)[0][0]]: np.eye(4)}
+    marker = np.array([index_of.get(key, -1) for key in seen_keys], int)
+    used = marker >= 0
+    firsts = np.cumsum([0, *(len(part.stamps_ns) for part in parts)])
+    frame = np.concatenate([part.frame + n for part, n in zip(parts, firsts, strict=False)])
+    views = RigViews(
+        frame=frame[used],
+        camera=np.concatenate([part.camera for part in parts])[used],
+        marker=marker[used],
+        corners_px=np.concatenate([part.corners_px for part in parts])[used],
+        size_m=np.array(sizes_m),
+        marker_ids=tuple(marker_id for _, marker_id in keys),
+        stamps_ns=_one_after_the_other([part.stamps_ns for part in parts]),
+    )
+    return RigData(parts[0].rig, views, markers, keys, known, tuple(parts), anchored)
+
+
+def _one_after_the_other(stamps_ns: Sequence[np.ndarray]) -> np.ndarray:
+    """Stamps of all recordings, ns, increasing; those of the first recording do not change."""
+    together = list(stamps_ns[:1])
+    for stamps in stamps_ns[1:]:
+        before = together[-1]
+        together.append(stamps - stamps[:1] + before[-1:] + _APART_NS)
+    return np.concatenate(together)
+
+
+def _keys(part: RecordedSightings, family: str) -> list[MarkerKey]:
+    families = part.families or (family,) * len(part.ids)
+    return [(name, int(marker_id)) for name, marker_id in zip(families, part.ids, strict=True)]
+
+
+def _known(
+    markers: MarkerMap | None, keys: Sequence[MarkerKey], marker_size_m: float | None
+) -> tuple[dict[int, np.ndarray], list[float]]:
+    """T_world_marker (4, 4) of the known markers by index, and the sizes of all, m."""
+    given, given_m, known, sizes_m = {}, list[float](), {}, []
+    if markers is not None:
+        Ts_world_marker = np.array(markers.Ts_world_marker.as_matrix(), float)
+        Ts_world_marker[:, :3, 3] += markers.origin_m
+        given_m = np.asarray(markers.size_m, float).tolist()
+        placed = zip(Ts_world_marker, given_m, strict=True)
+        given = dict(zip(marker_keys(markers), placed, strict=True))
+    for index, (family, marker_id) in enumerate(keys):
+        if (family, marker_id) in given:
+            known[index], size_m = given[family, marker_id]
+        elif marker_size_m is not None or len(set(given_m)) == 1:
+            size_m = given_m[0] if marker_size_m is None else marker_size_m
+        else:
+            problem = f"missing: how large is marker {marker_id} ({family}), which is in no map?"
+            raise BadInput("--marker-size-m", problem)
+        sizes_m.append(size_m)
+    return known, sizes_m
+
+
+# --- results -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -100,7 +239,12 @@ class RigResults:
                 cameras=calibration.cameras,
                 Ts_camera_vehicle=jaxlie.SE3(jnp.asarray(np.stack(poses), float)),
             )
-            cameras = [self._camera_sigma(camera) for camera in range(C)]
+            cameras = [
+                CameraSigma(**_placed_sigma(self.sigmas[c]), **self._lens_sigma(c))
+                if calibration.calibrated[c]
+                else CameraSigma()
+                for c in range(C)
+            ]
             save_rig(out / "rig.yaml", rig, self.calibrated, cameras)
         # The check takes no place as given.
         given = data.known if data.anchored and self.command != "check" else {}
@@ -113,11 +257,6 @@ class RigResults:
         poses = [pose_from_matrix(T) for T in calibration.Ts_world_vehicle]
         write_tum(out / "trajectory.tum", calibration.views.stamps_ns / 1e9, np.stack(poses))
         return names
-
-    def _camera_sigma(self, camera: int) -> CameraSigma:
-        if not self.calibration.calibrated[camera]:
-            return CameraSigma()
-        return CameraSigma(**_placed_sigma(self.sigmas[camera]), **self._lens_sigma(camera))
 
     def _with_unseen(self) -> tuple[MarkerMap, int]:
         """The found map with the given map's unseen markers added where they are, and how many
