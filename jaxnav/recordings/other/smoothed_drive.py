@@ -8,24 +8,16 @@ pilot does beside it: it restarts nothing and outvotes nobody.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxnav.core.filter.estimate import Belief
 from jaxnav.core.models.geometry import planar_from_T_world_vehicle
 from jaxnav.core.models.origin import Origin, planar_in_world, poses_in_world
-from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.observation import Observation
 from jaxnav.recordings.drive_events import DriveEvents
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.other.smoothed import Kept, Localised, Packed, smooth_chunks
-
-CHUNK_EVENTS = 64
+from jaxnav.recordings.other.localise import CHUNK_FRAMES, Localised, localise
 
 
 @dataclass(frozen=True)
@@ -83,59 +75,24 @@ def smooth_drive(
         setup: its navigator filters.
         progress: called with the number of events done since the last call, twice for each.
     """
-    navigator, total = setup.navigator(), len(events)
-    begins = range(0, total, CHUNK_EVENTS)
-    belief = navigator.init().belief
-    filtered, smoothed, kept = [], [], []
-    for begin in begins:
-        belief, chunk, poses = _filter(navigator, belief, _chunk(events, begin))
-        kept.append(Packed.from_kept(chunk))
-        filtered.append(poses)
-        progress(min(CHUNK_EVENTS, total - begin))
-    back = smooth_chunks(navigator, 1, kept, lambda index: _chunk(events, begins[index]))
-    for index, poses in back:
-        smoothed.append(jax.tree.map(lambda leaf: leaf[:, 0], poses))
-        progress(min(CHUNK_EVENTS, total - begins[index]))
-    origin_m = setup.markers.origin_m
+    found, total = [], len(events)
+    for begin, poses in localise(
+        setup.navigator(),
+        total,
+        lambda begin: jax.tree.map(lambda leaf: leaf[begin : begin + CHUNK_FRAMES], events.obs),
+        smooth=True,
+    ):
+        found.append(jax.device_get(jax.tree.map(lambda leaf: leaf[:, 0], poses)))
+        progress(min(CHUNK_FRAMES, total - begin))
+    count, origin_m = len(found) // 2, setup.markers.origin_m
     return (
-        _track(events.stamps_ns, filtered, origin_m),
-        _track(events.stamps_ns, smoothed[::-1], origin_m),
+        _track(events.stamps_ns, found[:count], origin_m),
+        _track(events.stamps_ns, found[count:][::-1], origin_m),
     )
-
-
-@eqx.filter_jit
-def _filter(
-    navigator: Navigator, belief: Belief, obs: Observation
-) -> tuple[Belief, Kept, Localised]:
-    """Filter a chunk of events: the belief after it, what a smoother needs, and the poses."""
-
-    def sense(belief: Belief, obs: Observation) -> tuple[Belief, tuple[Kept, Localised]]:
-        belief, estimate = navigator.sense(belief, obs)
-        return belief, (
-            Kept.from_estimate(belief, estimate),
-            Localised.from_estimate(estimate),
-        )
-
-    belief, (kept, poses) = jax.lax.scan(sense, belief, obs)
-    return belief, jax.tree.map(lambda leaf: leaf[:, None], kept), poses  # one track
-
-
-def _chunk(events: DriveEvents, begin: int) -> Observation:
-    """A chunk of events, padded beyond the last one with events that tell nothing, at its time."""
-    rows = np.arange(begin, begin + CHUNK_EVENTS)
-    known = rows < len(events)
-    obs: Any = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf[np.minimum(rows, len(events) - 1)]), events.obs
-    )
-    shown = obs.visible & known[:, None, None], obs.has_odometry & known, obs.dt_s * known
-    padded: Observation = eqx.tree_at(lambda o: (o.visible, o.has_odometry, o.dt_s), obs, shown)
-    return padded
 
 
 def _track(stamps_ns: np.ndarray, chunks: list[Localised], origin_m: Origin) -> DriveTrack:
-    whole = jax.tree.map(
-        lambda *leaves: np.concatenate(leaves)[: len(stamps_ns)], *map(jax.device_get, chunks)
-    )
+    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(stamps_ns)], *chunks)
     # In the vehicle's own axes, the last of which is vertical.
     covariance = np.where(whole.located[:, None, None], whole.covariance, 0).astype(float)
     position = np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1]

@@ -16,11 +16,10 @@ from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.files import write_params
-from jaxnav.recordings.other import replay as replays
-from jaxnav.recordings.other import smoothed
+from jaxnav.recordings.other import localise
+from jaxnav.recordings.other.localise import CHUNK_FRAMES, filter_frames, smooth_frames
 from jaxnav.recordings.other.recordings import Recording, read_recording
-from jaxnav.recordings.other.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
-from jaxnav.recordings.other.smoothed import smooth_frames
+from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, replay
 from jaxnav.recordings.ros.odometry_track import OdometryTrack
 from tests.helpers.compiling import jit_to_run
 
@@ -45,9 +44,9 @@ def keep_the_compile_cache(monkeypatch):
 @pytest.fixture
 def run_banks_fast(monkeypatch):
     """A bank takes longer over a whole recording than to be optimised."""
-    chunk = jit_to_run(replays._run_chunk.__wrapped__, static_argnums=(3, 4))
-    monkeypatch.setattr(replays, "_run_chunk", chunk)
-    monkeypatch.setattr(smoothed, "smooth_frames", jit_to_run(smooth_frames.__wrapped__))
+    fast = jit_to_run(filter_frames.__wrapped__, static_argnums=(3, 4))
+    monkeypatch.setattr(localise, "filter_frames", fast)
+    monkeypatch.setattr(localise, "smooth_frames", jit_to_run(smooth_frames.__wrapped__))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,242 @@
+"""Localise the frames of a recording by a filter, a chunk at a time, and smooth their poses.
+
+`Navigator.sense`, which runs on a vehicle too, is scanned over the frames; a smoother goes back
+from their end through the beliefs that were kept.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jaxlie
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxnav.core.filter.bank import Bank, heaviest
+from jaxnav.core.filter.estimate import Belief, Estimate
+from jaxnav.core.filter.hypotheses import MultiHypothesis
+from jaxnav.core.filter.smooth import Trail, doubt
+from jaxnav.core.linalg.small_matrices import first_highest
+from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad
+from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.navigator import Navigator
+from jaxnav.core.pose.observation import Observation
+from jaxnav.core.pose.refine import Candidates
+
+CHUNK_FRAMES = 64
+
+
+class Localised(eqx.Module):
+    """The localised frames of a recording, leading axes (F, tracks) or none."""
+
+    T_world_vehicle: jaxlie.SE3
+    covariance: Float[Array, "... 6 6"]  # of xi in T_world_vehicle * cay(xi)
+    located: Bool[Array, "..."]
+    decided: Bool[Array, "..."]
+    flip_probability: Float[Array, "..."]
+    candidates: Candidates
+    selected: Int[Array, "..."]  # of the candidates; -1: none
+
+    @staticmethod
+    def from_estimate(estimate: Estimate) -> "Localised":
+        """The poses of one filtered frame."""
+        same = {f.name: getattr(estimate, f.name) for f in dataclasses.fields(Localised)}
+        return Localised(**same | {"covariance": estimate.covariance[:6, :6]})
+
+
+class _Kept(eqx.Module):
+    """The part of filtered frames that a smoother needs, leading axes (F, tracks) or none."""
+
+    belief: Belief  # without what repeats
+    candidates: Candidates
+
+
+class _Packed(NamedTuple):
+    """`_Kept` on the host, moments of living hypotheses alone: of 24 slots one or two live."""
+
+    bare: _Kept  # its bank without mean and covariance
+    moments: list[np.ndarray]  # (rows, n) and (rows, d, d)
+
+    @staticmethod
+    def from_kept(kept: _Kept) -> "_Packed":
+        kept = jax.device_get(kept)
+        lives = np.asarray(kept.belief.bank.initialised)
+        moments = [np.asarray(whole)[lives] for whole in _moments(kept)]
+        return _Packed(eqx.tree_at(_moments, kept, (None, None)), moments)
+
+    def unpack(self) -> _Kept:
+        """The frames; hypotheses that don't live are zero."""
+        lives = np.asarray(self.bare.belief.bank.initialised)
+        filled = []
+        for rows in self.moments:
+            filled.append(np.zeros((*lives.shape, *rows.shape[1:]), rows.dtype))
+            filled[-1][lives] = rows
+        return eqx.tree_at(_moments, self.bare, tuple(filled), is_leaf=lambda leaf: leaf is None)
+
+
+def _moments(kept: _Kept) -> tuple[Array, Array]:
+    return kept.belief.bank.mean, kept.belief.bank.covariance
+
+
+def localise(
+    navigator: Navigator,
+    frames: int,
+    observations: Callable[[int], Observation],
+    alone: bool = False,
+    smooth: bool = False,
+) -> Iterator[tuple[int, Localised]]:
+    """Filter all frames; then, if asked for, smooth them from the last to the first.
+
+    Args:
+        frames: how many there are.
+        observations: those from an index on, `CHUNK_FRAMES` at most, (F, ...) in every leaf.
+        alone: whether each marker is tracked alone, as if it were the only one.
+
+    Yields:
+        The index of a chunk's first frame, and (CHUNK_FRAMES, tracks) poses, where what is beyond
+        the last frame means nothing.
+    """
+    tracks, begins = len(navigator.markers.ids) if alone else 1, range(0, frames, CHUNK_FRAMES)
+    start = _alone(navigator, 0) if alone else navigator
+    beliefs = _repeated(start.init().belief, tracks)
+    kept: list[_Packed] = []
+    for begin in begins:
+        obs = _chunk(observations(begin))
+        beliefs, poses, to_smooth = filter_frames(navigator, beliefs, obs, alone, smooth)
+        if to_smooth is not None:
+            kept.append(_Packed.from_kept(to_smooth))
+        yield begin, poses
+    bank = navigator.motion.init(navigator.selector.hypotheses)
+    end = _repeated((Trail.begin(bank, jnp.asarray(False)), bank.parent), tracks)
+    behind: _Behind | None = None
+    for begin in reversed(begins) if smooth else ():
+        obs = _chunk(observations(begin))
+        behind = behind or (*end, jax.tree.map(lambda leaf: leaf[0], obs))  # any
+        behind, poses = smooth_frames(navigator, behind, kept.pop().unpack(), obs)
+        yield begin, poses
+
+
+def _repeated(tree: Any, count: int) -> Any:
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), tree)
+
+
+def _chunk(obs: Observation) -> Observation:
+    """Frames, padded by the last one again, which then shows nothing and is at the same time."""
+    count = len(obs.visible)
+    whole: Observation = jax.tree.map(lambda leaf: padded(leaf, CHUNK_FRAMES), obs)
+    known = jnp.arange(CHUNK_FRAMES) < count
+    visible = whole.visible & known[:, None, None]
+    shown = visible, whole.has_odometry & known, whole.dt_s * known
+    padding_blind: Observation = eqx.tree_at(
+        lambda o: (o.visible, o.has_odometry, o.dt_s), whole, shown
+    )
+    return padding_blind
+
+
+def padded(rows: np.ndarray, count: int) -> Array:
+    """Pad rows to a number of them by repeating the last one."""
+    return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def filter_frames(
+    navigator: Navigator, beliefs: Belief, obs: Observation, alone: bool, keep: bool
+) -> tuple[Belief, Localised, _Kept | None]:
+    """Filter F frames in all tracks: the (tracks,) beliefs after them, their poses, and, if asked
+    for, what a smoother needs of them."""
+
+    def track(belief: Belief, obs: Observation, marker: Array) -> tuple[Belief, tuple]:
+        of_track = navigator
+        if alone:
+            of_track = _alone(navigator, marker)
+            seen = obs.corners_px[:, marker][:, None], obs.visible[:, marker][:, None]
+            obs = dataclasses.replace(obs, corners_px=seen[0], visible=seen[1])
+        belief, estimate = of_track.sense(belief, obs)
+        kept = None
+        if keep:
+            kept = _Kept(dataclasses.replace(belief, repeats=None), estimate.candidates)
+        return belief, (Localised.from_estimate(estimate), kept)
+
+    def frame(beliefs: Belief, obs: Observation) -> tuple[Belief, tuple]:
+        tracks = jnp.arange(len(navigator.markers.ids) if alone else 1)
+        told: tuple[Belief, tuple] = jax.vmap(track, (0, None, 0))(beliefs, obs, tracks)
+        return told
+
+    beliefs, (poses, kept) = jax.lax.scan(frame, beliefs, obs)
+    return beliefs, poses, kept
+
+
+def _alone(navigator: Navigator, index: Array | int) -> Navigator:
+    alone: Navigator = eqx.tree_at(
+        lambda n: n.markers, navigator, single_marker(navigator.markers, index)
+    )
+    return alone
+
+
+def single_marker(markers: MarkerMap, index: Array | int) -> MarkerMap:
+    """A map of the one marker at an index."""
+    T_world_marker = jaxlie.SE3(markers.Ts_world_marker.wxyz_xyz[index][None])
+    return MarkerMap(T_world_marker, markers.size_m[index][None], ids=(0,), families=("",))
+
+
+# Of what lies behind a frame on the way back, for each track; and the observation of all tracks.
+_Behind = tuple[Trail, Int[Array, "tracks K"], Observation]
+
+
+@jax.jit
+def smooth_frames(
+    navigator: Navigator, behind: _Behind, kept: _Kept, obs: Observation
+) -> tuple[_Behind, Localised]:
+    """Go back through frames, from the last to the first.
+
+    Args:
+        navigator: the one that filtered them.
+        behind: of the last frame.
+        kept: (F, tracks) frames.
+        obs: F observations, of which `dt_s` and the odometry are used.
+    """
+
+    def one(
+        trail: Trail, parent: Array, kept: _Kept, later: Observation
+    ) -> tuple[Trail, Localised]:
+        belief = kept.belief
+        trail = trail.back(navigator.motion, belief.bank, belief.decided, parent, later)
+        return trail, _report(navigator, trail, kept)
+
+    def back(behind: _Behind, frame: tuple[_Kept, Observation]) -> tuple[_Behind, Localised]:
+        (trail, parent, later), (kept, obs) = behind, frame
+        trail, smoothed = jax.vmap(one, (0, 0, 0, None))(trail, parent, kept, later)
+        return (trail, kept.belief.bank.parent, obs), smoothed
+
+    smoothed: tuple[_Behind, Localised] = jax.lax.scan(back, behind, (kept, obs), reverse=True)
+    return smoothed
+
+
+def _report(navigator: Navigator, trail: Trail, kept: _Kept) -> Localised:
+    """What is reported of one frame of one track."""
+    motion, belief, selector = navigator.motion, kept.belief, navigator.selector
+    bank: Bank = trail.as_bank(belief.bank)
+    best = heaviest(bank)
+    T = motion.T_world_vehicle(bank.mean[best])
+    flip_probability, decided = belief.flip_probability, trail.decided
+    if isinstance(selector, MultiHypothesis):
+        flip_probability = doubt(motion, bank, selector.far_rad)
+        decided = bank.initialised[best] & (flip_probability < selector.decided_mass)
+    candidates = kept.candidates
+    off_rad = jax.vmap(lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T))(
+        candidates.T_vehicle_world
+    )
+    nearest = first_highest(-jnp.where(candidates.valid, off_rad, jnp.inf), EVEN_RAD)
+    return Localised(
+        T_world_vehicle=T,
+        covariance=motion.error_covariance(bank, best)[:6, :6],
+        located=bank.initialised[best],
+        decided=decided,
+        flip_probability=flip_probability,
+        candidates=candidates,
+        selected=jnp.where(jnp.any(candidates.valid) & bank.initialised[best], nearest, -1),
+    )
