@@ -13,7 +13,6 @@ import hashlib
 import os
 import pickle
 import platform
-import re
 import time
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
@@ -31,10 +30,15 @@ from jax.tree_util import PyTreeDef
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from jaxnav.files.private import NotPrivateError, PrivateFolder
+from jaxnav.files.private import (
+    NotPrivateError,
+    private_folder,
+    read_private,
+    write_private,
+)
 
 _KEPT = 64  # the last used executables, some MB each, are kept
-_NAME = re.compile(r"[0-9a-f]{64}\.step")
+_NAMES = f"{64 * '[0-9a-f]'}.step"
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 # Rooms that only call compiled programs or draw their results.
 _WITHOUT = (
@@ -56,7 +60,7 @@ def keep_in(folder: Path | None) -> None:
     Args:
         folder: made if it is missing. Executables are run without a check: if anybody else may
             write to it, or to anything on its path, nothing is loaded and nothing is kept, see
-            `PrivateFolder`.
+            `private_folder`.
     """
     _folders[:] = [] if folder is None else [folder]
 
@@ -107,16 +111,15 @@ def program(
     Loaded if another process has kept it, else compiled and kept.
     """
     jax.monitoring.record_event(ASKED)
-    given, inputs = _asked(arguments)
-    name = _file(_name(function, given), inputs)
+    name, given, inputs = _asked(function, arguments)
     return _loaded(folder, name, inputs) or _compiled(function, folder, name, given, inputs)
 
 
 def is_kept(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path) -> bool:
     """Whether `program` finds the executable in the folder."""
-    given, inputs = _asked(arguments)
-    with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
-        return files.holds(_file(_name(function, given), inputs))
+    name, *_ = _asked(function, arguments)
+    with suppress(OSError, NotPrivateError):
+        return (private_folder(folder) / name).is_file()
     return False
 
 
@@ -132,13 +135,14 @@ def sources_digest(package: Path, without: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-def _asked(arguments: tuple[PyTree, ...]) -> tuple[PyTreeDef, list[jax.ShapeDtypeStruct]]:
+def _asked(
+    function: Callable[..., PyTree], arguments: tuple[PyTree, ...]
+) -> tuple[str, PyTreeDef, list[jax.ShapeDtypeStruct]]:
+    """The name of a program's file, and the structure and leaves of its arguments."""
     leaves, given = jax.tree.flatten(arguments)
-    return given, jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
-
-
-def _name(function: Callable[..., PyTree], given: PyTreeDef) -> str:
-    return str((f"{function.__module__}.{function.__qualname__}", given))
+    inputs = jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
+    called = f"{function.__module__}.{function.__qualname__}"
+    return _file(str((called, given)), inputs), given, inputs
 
 
 def _compiled(
@@ -173,8 +177,7 @@ def _loaded(
     folder: Path, name: str, inputs: list[jax.ShapeDtypeStruct]
 ) -> tuple[Run, PyTreeDef] | None:
     try:
-        with PrivateFolder(folder) as files:
-            raw = files.read(name)
+        raw = read_private(private_folder(folder) / name)
         content = raw[_CHECKSUM_BYTES:]
         # Damaged machine code may do anything: it must not even be parsed.
         if hashlib.sha256(content).digest() != raw[:_CHECKSUM_BYTES]:
@@ -195,11 +198,12 @@ def _loaded(
 def _keep(folder: Path, name: str, raw: bytes) -> None:
     """Write an executable completely or not at all, and keep only the `_KEPT` last used ones."""
     # A full, foreign or unsafe disk is ignored: the program is in memory all the same.
-    with suppress(OSError, NotPrivateError), PrivateFolder(folder, make=True) as files:
-        files.write(name, raw)
-        ours = [name for name in files.names_by_use() if _NAME.fullmatch(name)]
-        for old in ours[:-_KEPT]:
-            files.remove(old)
+    with suppress(OSError, NotPrivateError):
+        path = private_folder(folder, make=True)
+        write_private(path / name, raw)
+        ours = sorted((old.lstat().st_mtime_ns, old) for old in path.glob(_NAMES))
+        for _, old in ours[:-_KEPT]:
+            old.unlink(missing_ok=True)
 
 
 def _file(structures: str, leaves: list[jax.ShapeDtypeStruct]) -> str:
