@@ -23,10 +23,10 @@ from pydantic import Field, field_validator, model_validator
 from jaxnav.core.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.origin import Origin, opposite, origin_near, poses_in_world
 from jaxnav.files import poses
-from jaxnav.files.provenance import Calibrated
-from jaxnav.files.rigs import pose_entry, with_provenance
+from jaxnav.files.provenance import Calibrated, file_text
+from jaxnav.files.rigs import pose_entry
 from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, read
-from jaxnav.files.writing import atomic_write, yaml_text
+from jaxnav.files.writing import atomic_write
 
 # The most that a corner may be off the best square, in sides: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03
@@ -167,7 +167,7 @@ def save_markers(
     for entry, sigma in zip(data["markers"], sigmas or (), strict=bool(sigmas)):
         if sigma is not None:
             entry["sigma"] = sigma.model_dump()
-    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
+    atomic_write(path, file_text(data, calibrated))
 
 
 def marker_data(markers: MarkerMap) -> dict[str, Any]:
@@ -195,7 +195,7 @@ def _file_data(markers: Sequence[MarkerEntry]) -> dict[str, Any]:
 
 def markers_text(markers: Sequence[MarkerEntry]) -> str:
     """The markers as the text of a map file."""
-    return yaml_text(_file_data(markers))
+    return file_text(_file_data(markers))
 
 
 def markers_left_out(file: MarkerFile) -> list[str]:

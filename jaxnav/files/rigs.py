@@ -40,7 +40,7 @@ from jaxnav.core.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Ti
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.provenance import Calibrated
+from jaxnav.files.provenance import Calibrated, file_text
 from jaxnav.files.ranges import Range, pinhole_problem, within
 from jaxnav.files.validation import (
     NAME_PATTERN,
@@ -57,7 +57,7 @@ from jaxnav.files.validation import (
     PositivePair,
     QuaternionPose,
 )
-from jaxnav.files.writing import atomic_write, yaml_text
+from jaxnav.files.writing import atomic_write
 
 Lens = Literal[
     "none",
@@ -298,24 +298,10 @@ def save_rig(
     Raises:
         BadInput: the file can't be written.
     """
-    atomic_write(path, rig_file_text(rig, calibrated, sigmas))
-
-
-def rig_file_text(
-    rig: CameraRig,
-    calibrated: Calibrated | None = None,
-    sigmas: Sequence[CameraSigma] | None = None,
-) -> str:
-    """What `save_rig` writes."""
     data = rig_data(rig)
     for entry, sigma in zip(data["cameras"], sigmas or (), strict=bool(sigmas)):
         entry["sigma"] = entry.get("sigma", {}) | sigma.model_dump(exclude_none=True)
-    return yaml_text(with_provenance(data, calibrated))
-
-
-def with_provenance(data: dict[str, Any], calibrated: Calibrated | None) -> dict[str, Any]:
-    """The content of a file, headed by its provenance if there is one."""
-    return data if calibrated is None else {"calibrated": calibrated.model_dump()} | data
+    atomic_write(path, file_text(data, calibrated))
 
 
 def rig_data(rig: CameraRig) -> dict[str, Any]:
@@ -361,7 +347,7 @@ def rig_text(cameras: Sequence[CameraEntry]) -> str:
             raise BadInput(where, problem)
         if not re.match(NAME_PATTERN, camera.name):
             raise BadInput(where, "can't be a camera's name (a letter first): give --camera-name")
-    return yaml_text(_file_data(cameras))
+    return file_text(_file_data(cameras))
 
 
 def rig_left_out(file: RigFile) -> list[str]:

@@ -34,7 +34,6 @@ from jaxnav.drive.health import Timeouts
 from jaxnav.drive.pilot import Pilot
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, Route, apply_params
-from jaxnav.files.bases import BaseFile
 from jaxnav.files.executables import PACKAGE, sources_digest
 from jaxnav.files.markers import MarkerFile, marker_data
 from jaxnav.files.ranges import problem_of
@@ -50,7 +49,7 @@ from jaxnav.files.validation import (
     at,
     validate,
 )
-from jaxnav.files.vehicles import VehicleFile, as_car, is_base_file, vehicle_data
+from jaxnav.files.vehicles import BaseFile, VehicleFile, as_car, is_base_file, vehicle_data
 from jaxnav.recordings.records import Flag
 
 SETUP_VERSION = 1
