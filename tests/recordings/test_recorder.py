@@ -1,6 +1,5 @@
 """The recorder writes its input, and no caller waits for it, whatever happens to the disk."""
 
-import errno
 import json
 import os
 import resource
@@ -123,23 +122,14 @@ def test_what_can_not_be_written_is_left_out(tmp_path):
     recorder.put("/own/topic", 2**70, {"anything": [1, 2]})
     recorder.close()
     assert (recorder.written, recorder.dropped, recorder.failed) == (2, 5, None)
+    recorder.close()
+    put_inputs(recorder, 1)
+    assert recorder.dropped == 6  # after its end
     log = read_drive(tmp_path / "drive.mcap")
+    assert not log.truncated
     assert len(log.inputs) == 1
     assert same_input(log.inputs[0], make_input(2))
     assert log.missing == {"/tick": 1}
-
-
-def test_closing_twice_and_recording_after_it(tmp_path):
-    recorder = Recorder(tmp_path / "drive.mcap", {})
-    put_inputs(recorder, 0)
-    recorder.close()
-    size = (tmp_path / "drive.mcap").stat().st_size
-    recorder.close()
-    put_inputs(recorder, 1)
-    recorder.image("/camera/front", 1, make_picture(1))
-    assert (recorder.written, recorder.dropped, recorder.failed) == (1, 2, None)
-    assert (tmp_path / "drive.mcap").stat().st_size == size
-    assert not read_drive(tmp_path / "drive.mcap").truncated
 
 
 @pytest.mark.parametrize(
@@ -152,9 +142,11 @@ def test_closing_twice_and_recording_after_it(tmp_path):
 )
 def test_a_file_that_can_not_be_made_is_named(tmp_path, name, problem):
     (tmp_path / "folder").mkdir()
-    with pytest.raises(BadInput, match=f"can't be written: {problem}") as error:
+    with pytest.raises(BadInput, match=f"^{tmp_path}/.*: can't be written: {problem}"):
         Recorder(tmp_path / name, {})
-    assert str(error.value).startswith(str(tmp_path))
+    with pytest.raises(TypeError):  # a header that is no JSON is the caller's error
+        Recorder(tmp_path / "drive.mcap", {"rig": object()})
+    assert not (tmp_path / "drive.mcap").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
@@ -163,27 +155,23 @@ def test_a_disk_that_is_full_from_the_start_is_named():
         Recorder("/dev/full", {})
 
 
-def test_a_header_that_is_no_json_is_the_callers_error(tmp_path):
-    with pytest.raises(TypeError):
-        Recorder(tmp_path / "drive.mcap", {"rig": object()})
-    assert not (tmp_path / "drive.mcap").exists()
-
-
-def _fill(recorder: Recorder) -> list[int]:
-    """Put outcomes that don't compress until it fails; the inputs that went with them."""
-    for index in range(100_000):
-        recorder.put(*input_message(make_input(3 * index)))
-        message = outcome_message(make_outcome(index), os.urandom(999).hex())
-        recorder.put("/outcome", 1, message)
-        if recorder.failed:
-            return index
-        time.sleep(0.0005)
-    pytest.fail("the disk never was full")
-
-
-def _check_what_is_left(recorder: Recorder, path: Path, problem: str) -> None:
-    put = _fill(recorder)
-    assert recorder.failed == f"{path}: can't be written: {problem}"
+def test_a_file_that_may_not_grow_ends_the_recording_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "drive.mcap"
+    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
+    recorder = Recorder(path, {"rig": "a rig"})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        for index in range(100_000):
+            put_inputs(recorder, 3 * index)
+            digest = os.urandom(999).hex()  # which does not compress
+            recorder.put("/outcome", 1, outcome_message(make_outcome(index), digest))
+            if recorder.failed:
+                break
+            time.sleep(0.0005)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert recorder.failed == f"{path}: can't be written: file too large"
     dropped = recorder.dropped
     put_inputs(recorder, 0)
     assert recorder.dropped == dropped + 1
@@ -191,48 +179,9 @@ def _check_what_is_left(recorder: Recorder, path: Path, problem: str) -> None:
     log = read_drive(path)
     assert log.truncated
     assert log.header == {"rig": "a rig"}
-    assert 0 < len(log.inputs) <= put + 1
+    assert 0 < len(log.inputs) <= index + 1
     for index, given in enumerate(log.inputs):
         assert same_input(given, make_input(3 * index))
-
-
-def test_a_write_that_fails_ends_the_recording_and_nothing_else(tmp_path, monkeypatch):
-    path, write = tmp_path / "drive.mcap", recorder_module._File.write
-    recorder = Recorder(path, {"rig": "a rig"})
-
-    def full(file, data):
-        if file.tell() + len(data) > 40_000:
-            write(file, data[: 40_000 - file.tell()])
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(file, data)
-
-    monkeypatch.setattr(recorder_module._File, "write", full)
-    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
-    _check_what_is_left(recorder, path, "no space left on device")
-
-
-def test_a_file_that_may_not_grow_ends_the_recording(tmp_path, monkeypatch):
-    path = tmp_path / "drive.mcap"
-    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
-    recorder = Recorder(path, {"rig": "a rig"})
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        _check_what_is_left(recorder, path, "file too large")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_a_real_disk_that_is_full_ends_the_recording(tmp_path, monkeypatch):
-    command = ["mount", "-t", "tmpfs", "-o", "size=128k", "jaxnav-test", str(tmp_path)]
-    if os.geteuid() or subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("only root may mount a small disk")
-    try:
-        monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
-        recorder = Recorder(tmp_path / "drive.mcap", {"rig": "a rig"})
-        _check_what_is_left(recorder, tmp_path / "drive.mcap", "no space left on device")
-    finally:
-        subprocess.run(["umount", str(tmp_path)], check=True)
 
 
 @pytest.fixture

@@ -245,29 +245,20 @@ def test_parameters_go_before_what_the_recording_tells(test_7, tmp_path, monkeyp
     assert np.abs(tracks[0][-1, 1:4] - own.T_world_vehicle[-1, 0, 4:]).max() > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["missing"], "missing: there is no such file or folder"),
-        (["{tmp}"], "no"),
-        (["{tmp}/x.txt"], "is no recording"),
-        (["{data}/test_7/tag_detections.bag.bz2"], "--rig: missing"),
-        (["{data}/test_7", "--rig", "nowhere.yaml"], "nowhere.yaml"),
-        (["{data}/test_7", "--params", "nowhere.yaml"], "nowhere.yaml"),
-        (["{data}/test_7", "--params", "{tmp}/p.yaml"], "odometry_sigma: this navigator has no su"),
-        (["{data}/test_7", "--limit", "0"], "--limit: must be at least 1, got 0"),
-        (["{data}/test_7", "--selector", "none"], "--selector"),
-        (["{data}/test_7", "--out", "{tmp}/x.txt"], "is a file, not a folder"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(data_dir, tmp_path, capsys, args, message):
+def test_bad_input_is_one_line_and_exit_code_2(data_dir, tmp_path, capsys):
     (tmp_path / "x.txt").write_text("no recording")
     write_params(tmp_path / "p.yaml", {"motion.odometry_sigma": [1.0] * 3})  # of a car
-    places = {"tmp": tmp_path, "data": data_dir / "tagslam"}
-    out = [] if "--out" in args else ["--out", str(tmp_path / "out")]
-    code = main(["replay", *(arg.format(**places) for arg in args), *out])
-    error = capsys.readouterr().err
-    assert code == 2
-    assert len(error.strip().splitlines()) == 1
-    assert message in error
+    folder = data_dir / "tagslam" / "test_7"
+    for args, message in [
+        (["missing"], "missing: there is no such file or folder"),
+        ([tmp_path / "x.txt"], "is no recording"),
+        ([folder / "tag_detections.bag.bz2"], "--rig: missing"),
+        ([folder, "--rig", "nowhere.yaml"], "nowhere.yaml"),
+        ([folder, "--params", tmp_path / "p.yaml"], "odometry_sigma: this navigator has no such n"),
+        ([folder, "--limit", "0"], "--limit: must be at least 1, got 0"),
+        ([folder, "--selector", "none"], "--selector"),
+    ]:
+        assert main(["replay", *map(str, args), "--out", str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert message in line
     assert not (tmp_path / "out").exists()

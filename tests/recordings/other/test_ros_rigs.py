@@ -109,27 +109,6 @@ def test_kalibr_s_figures_go_by_name(tmp_path):
     np.testing.assert_allclose(entry.T_matrix(), recording.imu.T_vehicle_imu, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("imu", "message"),
-    [
-        ("{topic: /imu}", "topics.yaml: imu.T_vehicle_imu: missing"),
-        (f"{{T_vehicle_imu: {PLACE}}}", "topics.yaml: imu: give one of topic and rostopic"),
-        (f"{{topic: /i, rostopic: /i, T_vehicle_imu: {PLACE}}}", "imu: give one of topic and ro"),
-        (f"{{topic: /i, T_vehicle_imu: {PLACE}, preset: good}}", "imu.preset: must be 'consumer'"),
-        (f"{{topic: /i, T_vehicle_imu: {PLACE}, imu_delay_s: 3}}", "imu.imu_delay_s: must be from"),
-        (f"{{topic: /i, T_vehicle_imu: {PLACE}, noise: 3}}", "imu.noise: unknown key"),
-        (
-            f"{{topic: /i, T_vehicle_imu: {PLACE}, gyroscope_noise_density: -1}}",
-            "imu.gyroscope_noise_density: must be > 0, got -1",
-        ),
-    ],
-)
-def test_a_bad_entry_is_named_with_its_key(tmp_path, imu, message):
-    with pytest.raises(BadInput) as caught:
-        topic_map(tmp_path, f"cameras: {{front: /a}}\nimu: {imu}\n")
-    assert message in str(caught.value)
-
-
 def test_topics_that_do_not_fit_are_one_line(tmp_path):
     path = small_bag("mcap").write(tmp_path)
     for topic, message in (
