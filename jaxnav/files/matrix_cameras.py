@@ -17,7 +17,7 @@ from collections.abc import Container
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AliasChoices, Field, field_validator, model_validator
+from pydantic import AfterValidator, AliasChoices, Field, field_validator, model_validator
 
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
@@ -214,21 +214,20 @@ class OpenCVCamera(MatrixCamera):
         return [self.image_width, self.image_height], lens
 
 
-_PhotonVisionSide = Annotated[float, Field(strict=True, ge=1, le=65536)]
+def _whole(value: float) -> int:
+    if value != int(value):
+        raise ValueError(f"must be a whole number of pixels, got {value:g}")
+    return int(value)
+
+
+_Side = Annotated[float, Field(strict=True, ge=1, le=65536), AfterValidator(_whole)]
 
 
 class Resolution(ForeignEntry):
     """PhotonVision's image size."""
 
-    width: _PhotonVisionSide
-    height: _PhotonVisionSide
-
-    @field_validator("width", "height")
-    @classmethod
-    def _whole(cls, value: float) -> float:
-        if value != int(value):
-            raise ValueError(f"must be a whole number of pixels, got {value:g}")
-        return value
+    width: _Side
+    height: _Side
 
 
 class PhotonVisionCamera(MatrixCamera):

@@ -60,7 +60,7 @@ from jaxnav.files import limits
 from jaxnav.files.ranges import RANGES
 from jaxnav.files.validation import Count, Entry
 from jaxnav.recordings.drive_format import NOT_FINITE
-from jaxnav.recordings.learnt import error_sigmas, errors_at, repeated_share
+from jaxnav.recordings.learnt import errors_of, repeated_share
 
 ODOMETRY, TWIST, FRAMES, TICK, OUTCOME = "/odometry", "/twist", "/frames", "/tick", "/outcome"
 IMAGE_SCHEMA = "foxglove.CompressedImage"
@@ -384,13 +384,11 @@ def _named(kind: Any, name: str) -> Column:
 
 
 def _errors(one: Outcome) -> np.ndarray:
-    bank = one.belief.bank
-    return np.asarray(bank.mean[errors_at(bank)])
+    return errors_of(one.belief.bank)[0]
 
 
 def _sigma(one: Outcome) -> np.ndarray:
-    bank = one.belief.bank
-    return error_sigmas(np.asarray(bank.covariance[errors_at(bank)[0]]))
+    return errors_of(one.belief.bank)[1]
 
 
 def _hypotheses(one: Outcome) -> np.ndarray:

@@ -16,8 +16,8 @@ from jaxnav.errors import BadInput
 from jaxnav.experiments.studies.store import check_sizes
 from jaxnav.files import limits
 from jaxnav.files.images import decode_image, read_image
-from jaxnav.files.npz import read_npz
 from jaxnav.files.reading import read_mapping
+from jaxnav.files.unpacking import read_npz
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.other import bags
 from jaxnav.recordings.other.bags import decompress_bag

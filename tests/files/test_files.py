@@ -11,7 +11,9 @@ import pytest
 import yaml
 
 from jaxnav import files
+from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.rig import PLACED_BY_HAND
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase
 from jaxnav.files import poses
 from jaxnav.files.rigs import CameraSigma
 from tests.helpers import seed_texts
@@ -84,43 +86,27 @@ def test_data_is_found_in_a_wheel_and_in_a_checkout(tmp_path, monkeypatch):
 
 
 def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
+    """With sigmas of places that are stated, left out, and exact."""
     text = yaml.safe_load((QCAR / "rig.yaml").read_text())
+    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 15.0]}
     odd = {"position_m": [0.1, 0.2, 0.3], "yaw_deg": 33.3, "elevation_deg": -7.1, "roll_deg": 1.7}
+    text["cameras"][0] |= {"sigma": stated}
     text["cameras"][1] |= odd | {"lens": "radtan", "distortion": [0.1, -0.02, 1e-3, 2e-4]}
-    text["cameras"][2] |= {"lens": "none", "distortion": []}
-    text["cameras"][3] |= {"exposure_s": 0.0123, "row_time_s": 0}
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(text))
-    rig = files.load_rig(tmp_path / "rig.yaml")
-    assert rig.cameras.focal_px.dtype == precision
+    text["cameras"][2] |= {"lens": "none", "distortion": []} | sigma_of([0] * 3, [0] * 3)
+    text["cameras"][3] |= {"exposure_s": 0.0123, "row_time_s": 0, "sigma": {"focal_px": [0.1] * 2}}
+    rig = files.load_rig(write(tmp_path, text))
+    assert rig.cameras.focal_px.dtype == rig.extrinsics_sigma.dtype == precision
     files.save_rig(tmp_path / "again.yaml", rig)
     again = files.load_rig(tmp_path / "again.yaml")
     assert leaves_equal(rig, again)
     assert (again.names, again.image_sizes_px) == (rig.names, rig.image_sizes_px)
     assert rig.timing(3) == again.timing(3) == (0.0123, 0.0)
     assert rig.timing(0) == again.timing(0) == rig.first(1).timing(0) == (None, None)
-
-
-def test_sigmas_of_places_read_back_bit_for_bit(precision, tmp_path):
-    """Stated, left out, and exact: read, written and read again."""
-    text = yaml.safe_load((QCAR / "rig.yaml").read_text())
-    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 15.0]}
-    text["cameras"][0]["sigma"] = stated
-    text["cameras"][2]["sigma"] = {"position_m": [0] * 3, "rotation_deg": [0] * 3}
-    text["cameras"][3]["sigma"] = {"focal_px": [0.1, 0.1]}  # says nothing of the place
-    rig = files.load_rig(write(tmp_path, text))
-    assert rig.extrinsics_sigma is not None
-    assert rig.extrinsics_sigma.dtype == precision
-    sigma = np.asarray(rig.extrinsics_sigma)
+    sigma = np.asarray(again.extrinsics_sigma)
     np.testing.assert_allclose(sigma[0, :3], stated["position_m"], rtol=1e-7)
     np.testing.assert_allclose(np.rad2deg(sigma[0, 3:]), stated["rotation_deg"], rtol=1e-6)
     np.testing.assert_array_equal(sigma[2], 0)
-    for index in (1, 3):
-        np.testing.assert_allclose(sigma[index], PLACED_BY_HAND, rtol=1e-7)
-    files.save_rig(tmp_path / "again.yaml", rig)
-    again = files.load_rig(tmp_path / "again.yaml")
-    assert again.extrinsics_sigma is not None
-    np.testing.assert_array_equal(again.extrinsics_sigma, sigma)
-    assert leaves_equal(rig, again)
+    np.testing.assert_allclose(sigma[[1, 3]], [PLACED_BY_HAND] * 2, rtol=1e-7)
 
 
 def test_cameras_are_placed_as_well_as_the_format_tells_or_are_exact(tmp_path):
@@ -380,6 +366,78 @@ def test_a_marker_stands_once_in_a_map(tmp_path):
     assert "marker 0 of tag36h11 is in the map twice" in line
 
 
+# --- bases that are no cars, and gyros ---
+
+DIFFERENTIAL = {
+    "base": "differential",
+    "forward_limit_mps": 1.2,
+    "turn_limit_radps": 3.0,
+    "time_constant_s": 0.15,
+}
+OMNI = DIFFERENTIAL | {"base": "mecanum", "left_limit_mps": 0.7}
+CAR = yaml.safe_load((QCAR / "vehicle.yaml").read_text())
+
+
+def vehicle_file(folder: Path, data: dict[str, Any]) -> Path:
+    return write(folder, data, "vehicle.yaml")
+
+
+def test_a_base_as_its_file_says(tmp_path):
+    base = files.load_vehicle(vehicle_file(tmp_path, DIFFERENTIAL | {"sigma": {"turn_gain": 0.1}}))
+    assert isinstance(base, TwistBase)
+    np.testing.assert_allclose(base.limits, [1.2, 0.0, 3.0])
+    np.testing.assert_allclose(
+        base.sensor_sigma, [DEFAULT_TWIST_SIGMA[0], 0.1, *DEFAULT_TWIST_SIGMA[2:]]
+    )
+    assert base.gyro is None
+    exact = dict.fromkeys(("speed_scale", "turn_gain", "turn_offset_radpm", "camera_delay_s"), 0.0)
+    assert files.load_vehicle(vehicle_file(tmp_path, OMNI | {"sigma": exact})).sensor_sigma is None
+
+
+@pytest.mark.parametrize("data", [DIFFERENTIAL, OMNI, CAR], ids=["differential", "omni", "car"])
+@pytest.mark.parametrize("gyro", [None, {"class": "tactical", "delay_s": 0.004}])
+def test_a_saved_vehicle_reads_back_bit_for_bit(data, gyro, tmp_path):
+    given = data if gyro is None else data | {"gyro": gyro}
+    vehicle = files.load_vehicle(vehicle_file(tmp_path, given))
+    files.save_vehicle(tmp_path / "saved.yaml", vehicle)
+    again = files.load_vehicle(tmp_path / "saved.yaml")
+    assert leaves_equal(again, vehicle)
+    if gyro is not None:
+        assert vehicle.gyro.delay_s == 0.004
+        assert vehicle.gyro.noise_density == GYROS["tactical"].noise_density
+
+
+def test_a_bad_base_is_named_with_its_key(tmp_path):
+    for changes, told in [
+        ({"base": "hovercraft"}, "base: must be"),
+        ({"turn_limit_radps": -1.0}, "turn_limit_radps: must be > 0"),
+        ({"forward_limit_mps": 1e5}, "forward_limit_mps: must be from"),
+        ({"left_limit_mps": 0.5}, "base differential can't move to its left"),
+        ({"base": "omni"}, "base omni needs left_limit_mps"),
+        ({"wheelbase_m": 0.3}, "wheelbase_m: unknown key"),
+        ({"sigma": {"steering_gain": 0.1}}, "sigma: unknown steering_gain"),
+        ({"sigma": {"turn_offset_radpm": 0.9}}, "sigma: turn_offset_radpm must be at most 0.35"),
+        ({"gyro": {"class": "best"}}, "gyro.class: must be"),
+        ({"gyro": {"noise_density": 0.0}}, "gyro.noise_density: must be"),
+        ({"gyro": {"delay_s": 3.0}}, "gyro.delay_s: must be"),
+        ({"gyro": {"bias": 3.0}}, "gyro.bias: unknown key"),
+    ]:
+        path = vehicle_file(tmp_path, DIFFERENTIAL | changes)
+        assert problem(files.load_vehicle, path).startswith(f"{path}: {told}")
+
+
+def test_where_only_cars_drive_other_vehicles_are_refused(tmp_path):
+    for data, told in (
+        (DIFFERENTIAL, "base: must be ackermann here"),
+        (CAR | {"gyro": {"class": "consumer"}}, "gyro: must be left out here"),
+    ):
+        path = vehicle_file(tmp_path, data)
+        assert problem(files.load_car, path).startswith(f"{path}: {told}")
+    assert (
+        float(files.load_car(vehicle_file(tmp_path, CAR | {"base": "ackermann"})).wheelbase_m) > 0
+    )
+
+
 # --- files of other tools ------------------------------------------------------------
 
 KALIBR = """
@@ -419,28 +477,20 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
 
 
-def test_a_camchain_may_have_k3(tmp_path):
+def test_a_camchain_may_have_k3_and_lenses_beside_the_pinhole(tmp_path):
     """As TagSLAM's files do, under ROS's name of the lens."""
-    coefficients = [0.1, -0.02, 0.001, 0.002, 0.003]
-    for model in ("radtan", "plumb_bob"):
-        data = yaml.safe_load(KALIBR)
-        data["cam1"] |= {"distortion_model": model, "distortion_coeffs": coefficients}
-        camera = files.load_rig(write(tmp_path, data)).cameras
-        assert camera.lenses[int(camera.lens_index[1])] == "radtan"
-        np.testing.assert_array_equal(camera.distortion[1], [*coefficients, *[0] * 7])
-
-
-def test_a_camchain_may_have_lenses_beside_the_pinhole(tmp_path):
-    path = write(tmp_path, seed_texts.SPHERES)
-    for name, lens, focal_px, coefficients in (
-        ("cam0", "omni", 1200, [1.5, -0.1, 0.02, 0.001, 0.002]),
-        ("cam1", "double_sphere", 380, [-0.2, 0.6]),
-        ("cam2", "eucm", 470, [0.6, 1.1]),
+    k3 = yaml.safe_load(KALIBR)
+    bend = [0.1, -0.02, 0.001, 0.002, 0.003]
+    k3["cam1"] |= {"distortion_model": "plumb_bob", "distortion_coeffs": bend}
+    for data, name, lens, focal_px, coefficients in (
+        (k3, "cam1", "radtan", 400, bend),
+        (seed_texts.SPHERES, "cam0", "omni", 1200, [1.5, -0.1, 0.02, 0.001, 0.002]),
+        (seed_texts.SPHERES, "cam1", "double_sphere", 380, [-0.2, 0.6]),
+        (seed_texts.SPHERES, "cam2", "eucm", 470, [0.6, 1.1]),
     ):
-        camera, _ = files.load_camera(path, name)
+        camera, _ = files.load_camera(write(tmp_path, data), name)
         assert camera.lenses == (lens,)
-        np.testing.assert_array_equal(camera.focal_px, [focal_px, focal_px + 1.5])
-        np.testing.assert_array_equal(camera.center_px, [639.7, 524.4])
+        assert float(camera.focal_px[0]) == focal_px
         np.testing.assert_array_equal(camera.distortion[: len(coefficients)], coefficients)
 
 
@@ -562,21 +612,21 @@ def test_a_failed_write_leaves_the_older_file_and_nothing_else(tmp_path):
 
 
 def test_where_nothing_can_be_written_is_one_line(tmp_path):
-    assert "it is a folder" in problem(files.atomic_write, tmp_path, "x")
-    assert "no such file" in problem(files.atomic_write, tmp_path / "none" / "a", "x")
     files.atomic_write(tmp_path / "file", "x")
-    assert "can't be written" in problem(files.atomic_write, tmp_path / "file" / "a", "x")
-    assert "is a file, not a folder" in problem(files.output_folder, tmp_path / "file")
-    assert "is a file, not a folder" in problem(files.output_folder, tmp_path / "file" / "deep")
-    assert files.output_folder(tmp_path / "deep" / "er").is_dir()
-    assert files.output_folder(tmp_path / "deep" / "er").is_dir()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_closed_folder_is_one_line(tmp_path):
+    for path, expected in (
+        (tmp_path, "it is a folder"),
+        (tmp_path / "none" / "a", "no such file"),
+        (tmp_path / "file" / "a", "can't be written"),
+    ):
+        assert expected in problem(files.atomic_write, path, "x")
+    for path in (tmp_path / "file", tmp_path / "file" / "deep"):
+        assert "is a file, not a folder" in problem(files.output_folder, path)
+    for _ in range(2):
+        assert files.output_folder(tmp_path / "deep" / "er").is_dir()
     (tmp_path / "closed").mkdir(mode=0o500)
-    assert "permission denied" in problem(files.output_folder, tmp_path / "closed")
-    assert "permission denied" in problem(files.atomic_write, tmp_path / "closed" / "a", "x")
+    if os.geteuid():  # root may write everywhere
+        assert "permission denied" in problem(files.output_folder, tmp_path / "closed")
+        assert "permission denied" in problem(files.atomic_write, tmp_path / "closed" / "a", "x")
 
 
 def test_json_has_plain_numbers_and_no_nan(tmp_path):

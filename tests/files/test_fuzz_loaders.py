@@ -35,6 +35,8 @@ from jaxnav.recordings.other.recordings import Recording
 from jaxnav.recordings.records import MESSAGES, OUTCOME, input_message, outcome_message
 from jaxnav.vehicles import replay
 from jaxnav.vehicles.options import number, whole_number
+from tests.fuzz.judge import small_programs
+from tests.fuzz.kept import kept_cases, replayed
 from tests.helpers.drives import make_input, make_outcome
 from tests.helpers.loader_seeds import BINARY, STRUCTURED, Loader
 from tests.helpers.mutations import Changed, edited, restructured
@@ -228,3 +230,22 @@ def test_an_option_is_a_number_within_its_bounds_or_bad_input(text):
         else:
             assert type(value) is kind
             assert 0 <= value <= 10
+
+
+# --- the failures once found by the long run (`make fuzz`) stay fixed ---
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory):
+    """Where sound files are made once."""
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.mark.parametrize("place", kept_cases(), ids=lambda place: place.name)
+def test_what_failed_once_is_told_in_a_line_or_does_not_matter(place, beside, monkeypatch):
+    # Commands choose a precision and a cache for their process; tests keep theirs.
+    monkeypatch.setattr("jax.config.update", lambda name, value: None)
+    scratch = beside / place.name
+    scratch.mkdir()
+    with small_programs():
+        assert replayed(place, scratch) is None

@@ -26,9 +26,9 @@ from jaxnav.files import (
     write_json,
     write_tum,
 )
-from jaxnav.recordings.other.odometry_delay import odometry_delay
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
+from jaxnav.recordings.ros.odometry_track import odometry_delay
 
 _DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 _SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history

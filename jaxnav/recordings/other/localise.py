@@ -1,12 +1,13 @@
 """Localise the frames of a recording by a filter, a chunk at a time, and smooth their poses.
 
-`Navigator.sense`, which runs on a vehicle too, is scanned over the frames; a smoother goes back
-from their end through the beliefs that were kept.
+`Navigator.sense`, which runs on a vehicle too, is scanned over the frames, or the events of a
+recorded drive; a smoother goes back from their end through the beliefs that were kept.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,11 +22,18 @@ from jaxnav.core.filter.estimate import Belief, Estimate
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.smooth import Trail, doubt
 from jaxnav.core.linalg.small_matrices import first_highest
-from jaxnav.core.models.geometry import EVEN_RAD, rotation_error_rad
+from jaxnav.core.models.geometry import (
+    EVEN_RAD,
+    planar_from_T_world_vehicle,
+    rotation_error_rad,
+)
 from jaxnav.core.models.markers import MarkerMap
+from jaxnav.core.models.origin import Origin, planar_in_world, poses_in_world
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.core.pose.refine import Candidates
+from jaxnav.recordings.drive_events import DriveEvents
+from jaxnav.recordings.drive_setup import DriveSetup
 
 CHUNK_FRAMES = 64
 
@@ -239,4 +247,99 @@ def _report(navigator: Navigator, trail: Trail, kept: _Kept) -> Localised:
         flip_probability=flip_probability,
         candidates=candidates,
         selected=jnp.where(jnp.any(candidates.valid) & bank.initialised[best], nearest, -1),
+    )
+
+
+# --- drives ---
+
+
+@dataclass(frozen=True)
+class DriveTrack:
+    """Where a vehicle was at N events.
+
+    Attributes:
+        stamps_ns: (N,).
+        Ts_world_vehicle: (N, 7) wxyz_xyz.
+        poses: (N, 3), x_m y_m psi_rad.
+        sigma_m, sigma_rad: (N,), of the position where it is known worst, and of the heading.
+        located, decided: (N,) bool.
+        flip_probability: (N,).
+    """
+
+    stamps_ns: Int[np.ndarray, " N"]
+    Ts_world_vehicle: Float[np.ndarray, "N 7"]
+    poses: Float[np.ndarray, "N 3"]
+    sigma_m: Float[np.ndarray, " N"]
+    sigma_rad: Float[np.ndarray, " N"]
+    located: Bool[np.ndarray, " N"]
+    decided: Bool[np.ndarray, " N"]
+    flip_probability: Float[np.ndarray, " N"]
+
+    def distances_to(
+        self, other: "DriveTrack"
+    ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+        """Distances (N,) m and (N,) rad to a track of the same events, NaN where not located."""
+        return distances(self.poses, other.poses, self.located & other.located)
+
+    @property
+    def positions_m(self) -> Float[np.ndarray, "N 3"]:
+        """Positions of the vehicle, (N, 3) m, NaN where not located."""
+        return np.where(self.located[:, None], self.Ts_world_vehicle[:, 4:], np.nan)
+
+
+def distances(
+    poses: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "N 3"], known: Bool[np.ndarray, " N"]
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Distances (N,) m and (N,) rad between planar poses, NaN where they are not known."""
+    apart = poses - others
+    turn_rad = np.abs(np.angle(np.exp(1j * apart[:, 2])))
+    shift_m = np.hypot(apart[:, 0], apart[:, 1])
+    return np.where(known, shift_m, np.nan), np.where(known, turn_rad, np.nan)
+
+
+def smooth_drive(
+    events: DriveEvents,
+    setup: DriveSetup,
+    progress: Callable[[int], object] = lambda events: None,
+) -> tuple[DriveTrack, DriveTrack]:
+    """The track of a drive as it was known at each event, and as it is known at the end.
+
+    A drive is filtered as the pilot's own navigator would, had nothing come late, and without what
+    the pilot does beside it: it restarts nothing and outvotes nobody.
+
+    Args:
+        setup: its navigator filters.
+        progress: called with the number of events done since the last call, twice for each.
+    """
+    found, total = [], len(events)
+    for begin, poses in localise(
+        setup.navigator(),
+        total,
+        lambda begin: jax.tree.map(lambda leaf: leaf[begin : begin + CHUNK_FRAMES], events.obs),
+        smooth=True,
+    ):
+        found.append(jax.device_get(jax.tree.map(lambda leaf: leaf[:, 0], poses)))
+        progress(min(CHUNK_FRAMES, total - begin))
+    count, origin_m = len(found) // 2, setup.markers.origin_m
+    return (
+        _track(events.stamps_ns, found[:count], origin_m),
+        _track(events.stamps_ns, found[count:][::-1], origin_m),
+    )
+
+
+def _track(stamps_ns: np.ndarray, chunks: list[Localised], origin_m: Origin) -> DriveTrack:
+    whole = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(stamps_ns)], *chunks)
+    # In the vehicle's own axes, the last of which is vertical.
+    covariance = np.where(whole.located[:, None, None], whole.covariance, 0).astype(float)
+    position = np.linalg.eigvalsh(covariance[:, :2, :2])[:, -1]
+    planar = jax.vmap(planar_from_T_world_vehicle)(whole.T_world_vehicle)
+    return DriveTrack(
+        stamps_ns,
+        np.asarray(poses_in_world(whole.T_world_vehicle.wxyz_xyz, origin_m), float),
+        np.asarray(planar_in_world(planar, origin_m), float),
+        np.sqrt(np.maximum(position, 0)),
+        np.sqrt(np.maximum(covariance[:, 5, 5], 0)),
+        whole.located,
+        whole.decided,
+        whole.flip_probability,
     )
