@@ -19,9 +19,6 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import CameraEntry, RigFile, rig_left_out, rig_of
 from jaxnav.files.validation import at, validate
 
-ImageSizePx = tuple[int, int]  # width, height
-CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
-
 
 @dataclass(frozen=True)
 class CameraFile:
@@ -33,7 +30,7 @@ class CameraFile:
         left_out: keys with values that no other file can be given.
     """
 
-    format: CameraFormat
+    format: Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
     cameras: tuple[CameraEntry, ...]
     left_out: tuple[str, ...]
 
@@ -56,7 +53,7 @@ def load_rig(path: str | Path) -> CameraRig:
     return rig_of(cameras)
 
 
-def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
+def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, tuple[int, int]]:
     """Read one camera and the size of its images in pixels (width, height).
 
     Args:
@@ -109,7 +106,7 @@ def camera_file(
     for tool, model in ONE_CAMERA_FORMATS.items():
         if data.keys() & set(model.format_keys):
             stored = validate(model, data, path)
-            camera = stored.camera(path, _name(data.get("camera_name")) or path.stem)
+            camera = stored.camera(_name(data.get("camera_name")) or path.stem)
             return CameraFile(tool, (camera,), tuple(stored.left_out(data)))
     raise BadInput(
         path,

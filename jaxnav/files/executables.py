@@ -30,12 +30,7 @@ from jax.tree_util import PyTreeDef
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from jaxnav.files.private import (
-    NotPrivateError,
-    private_folder,
-    read_private,
-    write_private,
-)
+from jaxnav.files.private import NotPrivateError, private_folder, read_private, write_private
 
 _KEPT = 64  # the last used executables, some MB each, are kept
 _NAMES = f"{64 * '[0-9a-f]'}.step"

@@ -27,13 +27,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.parameters import (
-    TUNABLES,
-    Tunable,
-    allowed_shapes,
-    parameters_of,
-    with_parameters,
-)
+from jaxnav.core.parameters import TUNABLES, Tunable, allowed_shapes, parameters_of, with_parameters
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import Entry, at, read, show_value, validate
 from jaxnav.files.writing import atomic_write, plain_data, yaml_text

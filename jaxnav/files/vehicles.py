@@ -59,7 +59,7 @@ from jaxnav.core.models.vehicle import (
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files.provenance import Calibrated, file_text
-from jaxnav.files.ranges import within
+from jaxnav.files.ranges import problem_of, within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.validation import (
     AngleDeg,
@@ -67,9 +67,11 @@ from jaxnav.files.validation import (
     FloorPlace,
     NonNegative,
     Number,
+    Place,
     Position,
     Positive,
     Radius,
+    Wrong,
     read,
     validate,
 )
@@ -98,12 +100,11 @@ class GyroEntry(Entry):
         )
 
 
-def _small_enough(sigma: dict[str, float], names: Iterable[str]) -> dict[str, float]:
+def _require_small(sigma: dict[str, float], names: Iterable[str]) -> None:
     for name, most in zip(names, _MOST_SIGMA, strict=True):
         if sigma.get(name, 0.0) > most:
             unit = {"rad": " rad", "s": " s"}.get(name.rsplit("_", 1)[-1], "")
-            raise ValueError(f"{name} must be at most {most:g}{unit}, got {sigma[name]:g}")
-    return sigma
+            raise Wrong("sigma", f"{name} must be at most {most:g}{unit}, got {sigma[name]:g}")
 
 
 def _sigmas(
@@ -133,10 +134,10 @@ class VehicleFile(Entry):
     sigma: dict[str, NonNegative] = Field(default_factory=dict)  # of the keys above, by their names
     resume: bool = False
 
-    @field_validator("sigma")
-    @classmethod
-    def _in_the_key_s_unit(cls, sigma: dict[str, float]) -> dict[str, float]:
-        return _small_enough(sigma, SENSOR_ERRORS)
+    @model_validator(mode="after")
+    def _agrees(self) -> Self:
+        _require_small(self.sigma, SENSOR_ERRORS)
+        return self
 
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
@@ -166,15 +167,11 @@ class BaseFile(Entry):
     gyro: GyroEntry | None = None
     resume: bool = False
 
-    @field_validator("sigma")
-    @classmethod
-    def _of_known_errors(cls, sigma: dict[str, float]) -> dict[str, float]:
-        for name in sigma.keys() - TWIST_ERRORS:
-            raise ValueError(f"unknown {name}: expected {', '.join(TWIST_ERRORS)}")
-        return _small_enough(sigma, TWIST_ERRORS)
-
     @model_validator(mode="after")
-    def _moves_as_it_can(self) -> Self:
+    def _agrees(self) -> Self:
+        for name in self.sigma.keys() - TWIST_ERRORS:
+            raise Wrong("sigma", f"unknown {name}: expected {', '.join(TWIST_ERRORS)}")
+        _require_small(self.sigma, TWIST_ERRORS)
         turns_alone = self.base in ("differential", "tracks")
         if turns_alone and self.left_limit_mps is not None:
             raise ValueError(f"base {self.base} can't move to its left: leave out left_limit_mps")
@@ -200,15 +197,6 @@ class StartEntry(Entry):
     x_m: Position
     y_m: Position
     psi_deg: AngleDeg
-
-
-class RouteFile(Entry):
-    """A route file."""
-
-    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
-    waypoint_radius_m: Radius
-    leave_m: Radius | None = None
-    start: StartEntry
 
 
 @dataclass(frozen=True)
@@ -240,6 +228,46 @@ class Route:
             (float(x_m), float(y_m), float(psi_rad)),
             self.leave_m,
         )
+
+
+class _RouteEntry(Entry):
+    """What all forms of a route have in common."""
+
+    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
+    waypoint_radius_m: Radius
+    leave_m: Radius | None = None
+
+    def _from(self, start_pose: tuple[float, float, float]) -> Route:
+        waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
+        return Route(waypoints_m, self.waypoint_radius_m, start_pose, self.leave_m)
+
+
+class RouteFile(_RouteEntry):
+    """A route file."""
+
+    start: StartEntry
+
+    def route(self) -> Route:
+        """The `Route` of this file."""
+        return self._from((self.start.x_m, self.start.y_m, math.radians(self.start.psi_deg)))
+
+
+class RecordedRoute(_RouteEntry):
+    """A route in the header of a recorded drive, with the numbers of `Route` itself."""
+
+    start_pose: Place
+
+    @field_validator("start_pose")
+    @classmethod
+    def _turned_little(cls, start_pose: list[float]) -> list[float]:
+        if problem := problem_of("angle_rad", start_pose[2]):
+            raise ValueError(f"psi {problem}")
+        return start_pose
+
+    def route(self) -> Route:
+        """The `Route` of this entry."""
+        x_m, y_m, psi_rad = self.start_pose
+        return self._from((x_m, y_m, psi_rad))
 
 
 def load_vehicle(path: str | Path) -> Vehicle | TwistBase:
@@ -359,10 +387,4 @@ def load_route(path: str | Path) -> Route:
     Raises:
         BadInput: one line naming file and key.
     """
-    entry = read(path, RouteFile)
-    return Route(
-        waypoints_m=tuple((x, y) for x, y in entry.waypoints_m),
-        waypoint_radius_m=entry.waypoint_radius_m,
-        start_pose=(entry.start.x_m, entry.start.y_m, math.radians(entry.start.psi_deg)),
-        leave_m=entry.leave_m,
-    )
+    return read(path, RouteFile).route()

@@ -24,9 +24,7 @@ _WORDS = (
 )
 
 
-def errors_of(
-    bank: Bank,
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+def errors_of(bank: Bank) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
     """The errors that the heaviest hypothesis of a vehicle keeps, and their sigmas.
 
     (k, g, o, tau) of `sensor_errors`, then three turns a camera in units of their prior's sigma,

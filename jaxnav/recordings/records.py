@@ -47,13 +47,7 @@ from jaxnav.core.models.origin import inverses_in_world, planar_in_world
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections
-from jaxnav.drive.interfaces import (
-    MOST_TURNS,
-    GyroReading,
-    Odometry,
-    Reading,
-    reading_of,
-)
+from jaxnav.drive.interfaces import MOST_TURNS, GyroReading, Odometry, Reading, reading_of
 from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
@@ -157,9 +151,7 @@ Flag = Annotated[bool, Field(strict=True)]
 Word = Annotated[str, Field(strict=True)]
 Faults = Annotated[Fault, _words(Fault)]
 Base64 = Annotated[
-    bytes,
-    BeforeValidator(_bytes),
-    WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+    bytes, BeforeValidator(_bytes), WithJsonSchema({"type": "string", "contentEncoding": "base64"})
 ]
 
 # --- inputs ---
@@ -592,10 +584,7 @@ MESSAGES: dict[str, tuple[str, type[TickMessage | OutcomeMessage]]] = {
     TWIST: ("jaxnav.Twist", TwistMessage),
     FRAMES: ("jaxnav.Frames", FramesMessage),
     TICK: ("jaxnav.Tick", TickMessage),
-    OUTCOME: (
-        "jaxnav.Outcome",
-        create_model("OutcomeMessage", __base__=OutcomeMessage, **_FIELDS),
-    ),
+    OUTCOME: ("jaxnav.Outcome", create_model("OutcomeMessage", __base__=OutcomeMessage, **_FIELDS)),
 }
 _KEPT = (
     *("type", "enum", "contentEncoding", "minimum", "exclusiveMaximum", "items", "minItems"),

@@ -23,7 +23,7 @@ QCAR = files.calib_dir() / "qcar"
 
 
 def leaves_equal(a: Any, b: Any) -> bool:
-    leaves_a, leaves_b = jax.tree.leaves(a), jax.tree.leaves(b)
+    leaves_a, leaves_b = (list(map(np.asarray, jax.tree.leaves(tree))) for tree in (a, b))
     return jax.tree.structure(a) == jax.tree.structure(b) and all(
         x.dtype == y.dtype and np.array_equal(x, y) for x, y in zip(leaves_a, leaves_b, strict=True)
     )

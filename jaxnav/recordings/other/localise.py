@@ -22,11 +22,7 @@ from jaxnav.core.filter.estimate import Belief, Estimate
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.smooth import Trail, doubt
 from jaxnav.core.linalg.small_matrices import first_highest
-from jaxnav.core.models.geometry import (
-    EVEN_RAD,
-    planar_from_T_world_vehicle,
-    rotation_error_rad,
-)
+from jaxnav.core.models.geometry import EVEN_RAD, planar_from_T_world_vehicle, rotation_error_rad
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.origin import Origin, planar_in_world, poses_in_world
 from jaxnav.core.navigator import Navigator
@@ -157,7 +153,9 @@ def filter_frames(
     """Filter F frames in all tracks: the (tracks,) beliefs after them, their poses, and, if asked
     for, what a smoother needs of them."""
 
-    def track(belief: Belief, obs: Observation, marker: Array) -> tuple[Belief, tuple]:
+    Told = tuple[Belief, tuple[Localised, _Kept | None]]
+
+    def track(belief: Belief, obs: Observation, marker: Array) -> Told:
         of_track = navigator
         if alone:
             of_track = _alone(navigator, marker)
@@ -169,9 +167,9 @@ def filter_frames(
             kept = _Kept(dataclasses.replace(belief, repeats=None), estimate.candidates)
         return belief, (Localised.from_estimate(estimate), kept)
 
-    def frame(beliefs: Belief, obs: Observation) -> tuple[Belief, tuple]:
+    def frame(beliefs: Belief, obs: Observation) -> Told:
         tracks = jnp.arange(len(navigator.markers.ids) if alone else 1)
-        told: tuple[Belief, tuple] = jax.vmap(track, (0, None, 0))(beliefs, obs, tracks)
+        told: Told = jax.vmap(track, (0, None, 0))(beliefs, obs, tracks)
         return told
 
     beliefs, (poses, kept) = jax.lax.scan(frame, beliefs, obs)
@@ -298,9 +296,7 @@ def distances(
 
 
 def smooth_drive(
-    events: DriveEvents,
-    setup: DriveSetup,
-    progress: Callable[[int], object] = lambda events: None,
+    events: DriveEvents, setup: DriveSetup, progress: Callable[[int], object] = lambda events: None
 ) -> tuple[DriveTrack, DriveTrack]:
     """The track of a drive as it was known at each event, and as it is known at the end.
 

@@ -139,10 +139,11 @@ class Rows:
         """
         keys = self.stamps_ns, self.cameras, *markers
         order = np.lexsort(keys[::-1])
-        same = np.logical_and.reduce([key[order[1:]] == key[order[:-1]] for key in keys])
-        twice = np.append(same, False) | np.insert(same, 0, False)
+        same = np.all([key[order[1:]] == key[order[:-1]] for key in keys], axis=0)
+        twice = (np.append(same, False) | np.insert(same, 0, False))[: len(order)]
         somewhere = is_within("corner_px", self.corners_px).all(axis=(1, 2))
-        return order[~twice[: len(order)] & somewhere[order]]
+        kept: np.ndarray = order[~twice & somewhere[order]]
+        return kept
 
 
 def rows_of(

@@ -116,9 +116,12 @@ def replay(
     frames_per_second = (total - compiled * CHUNK_FRAMES) / (clock_s[count] - clock_s[compiled])
 
     def joined(chunks: list[_Judged], filtered: Replay | None = None) -> Replay:
-        pose, *judged = jax.tree.map(lambda *leaves: np.concatenate(leaves)[:total], *chunks)
+        pose, seen, located, decided, flip_probability, nees, branch = jax.tree.map(
+            lambda *leaves: np.concatenate(leaves)[:total], *chunks
+        )
         pose = np.asarray(poses_in_world(pose, recording.markers.origin_m))
-        return Replay(pose, *judged, frames_per_second, corner_sigma_px, filtered)
+        told = pose, seen, located, decided, flip_probability, nees, branch
+        return Replay(*told, frames_per_second, corner_sigma_px, filtered)
 
     filtered = joined(chunks[:count])
     return joined(chunks[count:][::-1], filtered) if smooth else filtered

@@ -127,11 +127,7 @@ def join_frames(frames: Iterable[tuple[int, FrameDetections]]) -> list[Input]:
 
 
 def read_ros_rig(
-    path: Path,
-    topics: TopicMap,
-    rig: CameraRig,
-    markers: MarkerMap,
-    corner_backend: str = "aruco",
+    path: Path, topics: TopicMap, rig: CameraRig, markers: MarkerMap, corner_backend: str = "aruco"
 ) -> Source:
     """Read all frames of a bag, and its IMU where the topic map has one.
 

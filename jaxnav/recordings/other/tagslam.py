@@ -29,16 +29,7 @@ from jaxnav.files.ranges import is_within, within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import pose_entry, rig_of
 from jaxnav.files.topics import OdometrySigma
-from jaxnav.files.validation import (
-    Count,
-    ForeignEntry,
-    Number,
-    Size,
-    Text,
-    Vector,
-    at,
-    validate,
-)
+from jaxnav.files.validation import Count, ForeignEntry, Number, Size, Text, Vector, at, validate
 from jaxnav.recordings.other.bags import ReceivedMessage, is_ros1_bag, read_messages
 from jaxnav.recordings.other.recording import Rows, Source, rows_of
 from jaxnav.recordings.ros.camera_messages import TAGSLAM, detections
@@ -237,11 +228,7 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> Source:
 
 
 def _only(
-    by_topic: Sequence[dict[str, Any]],
-    topic: str,
-    kind: str,
-    where: str,
-    recorded: Sequence[_Bag],
+    by_topic: Sequence[dict[str, Any]], topic: str, kind: str, where: str, recorded: Sequence[_Bag]
 ) -> Any:
     """What the one bag that has a topic holds of it."""
     found = [held[topic] for held in by_topic if topic in held]
