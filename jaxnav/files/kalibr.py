@@ -80,8 +80,8 @@ class KalibrCamera(ForeignEntry):
         *coefficients, fu, fv, _, _ = self.intrinsics
         if min(fu, fv) <= 0:
             raise Wrong("intrinsics", f"the focal lengths must be > 0, got {[fu, fv]}")
-        if leading and (problem := coefficients_problem(_SPHERES[model], coefficients)):
-            raise Wrong("intrinsics", problem)
+        if leading and (wrong := coefficients_problem(_SPHERES[model], coefficients)):
+            raise Wrong("intrinsics", wrong)
         if (bent_by := self.distortion_model) not in (known := _BENT_BY[model]):
             of_which = "" if model == "pinhole" else f" for camera_model {model}"
             problem = f"must be one of {', '.join(known)}{of_which}, got {bent_by!r}"
@@ -95,8 +95,8 @@ class KalibrCamera(ForeignEntry):
         if count not in allowed:
             problem = f"must have {' or '.join(map(str, allowed))} numbers, got {count}"
             raise Wrong("distortion_coeffs", problem)
-        if problem := pinhole_problem(self.intrinsics[-4:], self.resolution):
-            raise ValueError(f"intrinsics, resolution: {problem}")
+        if wrong := pinhole_problem(self.intrinsics[-4:], self.resolution):
+            raise ValueError(f"intrinsics, resolution: {wrong}")
         return self
 
     def camera(

@@ -66,11 +66,11 @@ def open_file(path: Path) -> BufferedReader:
 
 
 @contextmanager
-def naming(path: str | Path, problem: str, *also: type[Exception]) -> Iterator[None]:
+def naming(path: str | Path, problem: str, also: type[Exception] = OSError) -> Iterator[None]:
     """Turn the system's errors about a file, and others, into `BadInput`."""
     try:
         yield
-    except (OSError, *also) as error:
+    except (OSError, also) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise BadInput(path, f"{problem}: {reason.lower()}") from None
 

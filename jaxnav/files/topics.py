@@ -15,7 +15,7 @@ with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, wit
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -164,6 +164,13 @@ class TopicMap(Entry):
     corner_sigma_px: CornerSigma = 0.3
     first_corner: FirstCorner = "bottom_left"
 
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read such a file; see `load_topics`."""
+        topics = read(path, cls)
+        topics._path = path
+        return topics
+
     @property
     def path(self) -> Path:
         """The file, for messages."""
@@ -185,20 +192,10 @@ def same_topic(topic: str, other: str | None) -> bool:
     return other is not None and topic.strip("/") == other.strip("/")
 
 
-Topics = TypeVar("Topics", bound=TopicMap)
-
-
 def load_topics(path: str | Path) -> TopicMap:
     """Read a topic map.
 
     Raises:
         BadInput: one line naming file and key.
     """
-    return read_topics(TopicMap, Path(path))
-
-
-def read_topics(kind: type[Topics], path: Path) -> Topics:
-    """Read a topic map, or a file that holds more than one; see `load_topics`."""
-    topics = read(path, kind)
-    topics._path = path
-    return topics
+    return TopicMap.load(Path(path))

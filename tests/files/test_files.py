@@ -234,20 +234,14 @@ BAD_CAMERAS = [
     ({"focal_px": 319}, "cameras.front.focal_px: must be a list, got 319"),
     ({"focal_px": ["319", 319]}, "cameras.front.focal_px[0]: must be a number, got the text '319'"),
     ({"center_px": [1e300, 1]}, "cameras.front.center_px[0]: must be <= 1e+09, got 1e+300"),
-    (
-        {"lens": "fisheye"},
-        "cameras.front.lens: must be 'none', 'radtan', 'rational', 'thin_prism', ",
-    ),
+    ({"lens": "fisheye"},
+     "cameras.front.lens: must be 'none', 'radtan', 'rational', 'thin_prism', "),
     ({"distortion": [1, 2, 3]}, "cameras.front.distortion: must have 4 coefficients"),
     ({"lens": "radtan", "distortion": [1] * 3}, "front.distortion: must have 4 or 5 coefficients"),
-    (
-        {"lens": "double_sphere", "distortion": [0.1, 1.2]},
-        "front.distortion: alpha of the lens double_sphere must be from 0 to 1, got 1.2",
-    ),
-    (
-        {"lens": "omni", "distortion": [-0.1, 0, 0, 0, 0]},
-        "front.distortion: xi of the lens omni must be at least 0, got -0.1",
-    ),
+    ({"lens": "double_sphere", "distortion": [0.1, 1.2]},
+     "front.distortion: alpha of the lens double_sphere must be from 0 to 1, got 1.2"),
+    ({"lens": "omni", "distortion": [-0.1, 0, 0, 0, 0]},
+     "front.distortion: xi of the lens omni must be at least 0, got -0.1"),
     ({"image_size_px": [820.5, 410]}, "front.image_size_px[0]: must be a whole number, got 820.5"),
     ({"image_size_px": [820, 0]}, "cameras.front.image_size_px[1]: must be >= 1, got 0"),
     ({"focal": 3}, "cameras.front.focal: unknown key"),
@@ -256,26 +250,18 @@ BAD_CAMERAS = [
     ({"T_camera_vehicle": np.eye(4).tolist()}, "got T_camera_vehicle and position_m"),
     ({"yaw_deg": None}, "cameras.front: position_m needs yaw_deg"),
     ({"position_m": None, "T_vehicle_camera": MIRROR}, "T_vehicle_camera: the 3x3 part has det(R)"),
-    (
-        {"position_m": None, "T_vehicle_camera": np.diag([1, 1, 1.01, 1]).tolist()},
-        "cameras.front.T_vehicle_camera: the 3x3 part is not a rotation",
-    ),
-    (
-        {"position_m": None, "T_vehicle_camera": np.ones((4, 4)).tolist()},
-        "cameras.front.T_vehicle_camera: the last row must be 0 0 0 1",
-    ),
-    (
-        {"position_m": None, "T_vehicle_camera": np.eye(3).tolist()},
-        "cameras.front.T_vehicle_camera[0]: must have at least 4 entries, got 3",
-    ),
-    (
-        {"position_m": None, "T_vehicle_camera": {"wxyz": [1, 1, 0, 0], "xyz_m": [0, 0, 0]}},
-        "cameras.front.T_vehicle_camera.wxyz: must have length 1, got 1.41421",
-    ),
+    ({"position_m": None, "T_vehicle_camera": np.diag([1, 1, 1.01, 1]).tolist()},
+     "cameras.front.T_vehicle_camera: the 3x3 part is not a rotation"),
+    ({"position_m": None, "T_vehicle_camera": np.ones((4, 4)).tolist()},
+     "cameras.front.T_vehicle_camera: the last row must be 0 0 0 1"),
+    ({"position_m": None, "T_vehicle_camera": np.eye(3).tolist()},
+     "cameras.front.T_vehicle_camera[0]: must have at least 4 entries, got 3"),
+    ({"position_m": None, "T_vehicle_camera": {"wxyz": [1, 1, 0, 0], "xyz_m": [0, 0, 0]}},
+     "cameras.front.T_vehicle_camera.wxyz: must have length 1, got 1.41421"),
     (sigma_of([-0.01, 0, 0], [0] * 3), "front.sigma.position_m[0]: must be >= 0, got -0.01"),
     (sigma_of([0, 0.51, 0], [0] * 3), "front.sigma.position_m[1]: must be <= 0.5, got 0.51"),
     ({"sigma": {"position_m": [0.01] * 3}}, "front.sigma: rotation_deg is missing: it goes with"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("change", "expected"), BAD_CAMERAS, ids=lambda v: str(v)[:40])

@@ -276,13 +276,6 @@ def test_a_drive_with_parameters_of_its_own_is_replayed_bit_for_bit(tuned, tmp_p
     assert f"1 parameter from {params} (loss: 0.5)\n" in capsys.readouterr().out
 
 
-def test_images_may_be_searched_anew(with_images, tmp_path):
-    code, summary = replayed(tmp_path, with_images, "--images")
-    assert code == 0
-    assert summary["changed"] == ["images"]
-    assert summary["rms_position_difference_m"] < 0.3
-
-
 def test_a_ros_bag_is_driven_too(drive, tmp_path):
     route, waypoints_m = tmp_path / "route.yaml", [list(point) for point in WAYPOINTS_M]
     start = "{x_m: 2.0, y_m: -1.0, psi_deg: 125.0}"

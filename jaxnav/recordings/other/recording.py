@@ -139,9 +139,9 @@ class Rows:
         """
         keys = self.stamps_ns, self.cameras, *markers
         order = np.lexsort(keys[::-1])
-        same = np.all([key[order[1:]] == key[order[:-1]] for key in keys], axis=0)
+        same = np.stack([key[order[1:]] == key[order[:-1]] for key in keys]).all(axis=0)
         twice = (np.append(same, False) | np.insert(same, 0, False))[: len(order)]
-        somewhere = is_within("corner_px", self.corners_px).all(axis=(1, 2))
+        somewhere = np.asarray(is_within("corner_px", self.corners_px).all(axis=(1, 2)))
         kept: np.ndarray = order[~twice & somewhere[order]]
         return kept
 
