@@ -70,13 +70,7 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, tupl
 
 def load_camera_entry(path: Path, name: str | None) -> CameraEntry:
     """Read one camera with its name and sigmas; arguments and errors as of `load_camera`."""
-    data = read_mapping(path)
-    file = camera_file(path, data)
-    if file.format in ("jaxnav", "kalibr"):
-        return choose_camera(path, file.cameras, name)
-    if name is not None and name != data.get("camera_name"):
-        raise BadInput(path, f"holds one camera, and it is not named {name!r}")
-    return file.cameras[0]
+    return choose_camera(path, camera_file(path, read_mapping(path)).cameras, name)
 
 
 def camera_file(

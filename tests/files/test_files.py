@@ -509,7 +509,8 @@ def test_a_camera_is_chosen_by_name(tmp_path):
     camera, _ = files.load_camera(write(tmp_path, KALIBR), "cam1")
     assert numbers(camera)[:2] == [400.0, 401.0]
     files.load_camera(write(tmp_path, ROS), "narrow")
-    assert "not named 'wide'" in problem(files.load_camera, write(tmp_path, ROS), "wide")
+    line = problem(files.load_camera, write(tmp_path, ROS), "wide")
+    assert line.endswith("has no camera 'wide': choose one of narrow")
 
 
 VEHICLE, ROUTE = ((QCAR / name).read_text() for name in ("vehicle.yaml", "route.yaml"))
