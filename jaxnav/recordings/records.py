@@ -532,19 +532,17 @@ _FIELDS: dict[str, Any] = {
 }
 
 
-def outcome_message(outcome: Outcome, state: str | None = None) -> dict[str, Any]:
+def outcome_message(outcome: Outcome) -> dict[str, Any]:
     """The message of an outcome.
 
     Args:
         outcome: with NumPy leaves in its output.
-        state: in place of its `digest`.
     """
     message = {}
     for name, column in COLUMNS.items():
         if (value := column.of(outcome)) is not None:
             message[name] = value.ravel() if isinstance(value, np.ndarray) and value.ndim else value
-    message["digest"] = digest(outcome) if state is None else state
-    return message
+    return message | {"digest": digest(outcome)}
 
 
 def digest(outcome: Outcome) -> str:

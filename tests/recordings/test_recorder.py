@@ -155,7 +155,7 @@ def test_a_file_that_may_not_grow_ends_the_recording_and_nothing_else(tmp_path, 
         for index in range(100_000):
             put_inputs(recorder, 3 * index)
             digest = os.urandom(999).hex()  # which does not compress
-            recorder.put("/outcome", 1, outcome_message(make_outcome(index), digest))
+            recorder.put("/outcome", 1, outcome_message(make_outcome(index)) | {"digest": digest})
             if recorder.failed:
                 break
             time.sleep(0.0005)
@@ -255,7 +255,7 @@ def test_a_pipe_that_nobody_empties(tmp_path):
 
         def fill():
             digest = os.urandom(10_000).hex()  # which does not compress
-            recorder.put("/outcome", 1, outcome_message(make_outcome(1), digest))
+            recorder.put("/outcome", 1, outcome_message(make_outcome(1)) | {"digest": digest})
             return recorder.dropped
 
         _until(fill)
