@@ -200,6 +200,7 @@ class GyroMessage(Entry):
 class TickMessage(Entry):
     """An `Input` without odometry and frames."""
 
+    VALUES: ClassVar[tuple[str, ...]] = ()  # the fields of a reading, in the order of `values`
     now_ns: Now
     faults: Faults
     gyro: list[GyroMessage] = Field(default_factory=list, max_length=MOST_TURNS)
@@ -208,10 +209,11 @@ class TickMessage(Entry):
         """The input of this message."""
         frames = tuple(frame.frame() for frame in getattr(self, "frames", ()))
         gyro = tuple(GyroReading(one.stamp_ns, one.turn_radps) for one in self.gyro)
-        return Input(self.now_ns, self._reading(), frames, self.faults, gyro)
-
-    def _reading(self) -> Reading | None:
-        return None
+        reading, fields = None, vars(self)
+        if self.VALUES:
+            values = [fields[name] for name in self.VALUES]
+            reading = reading_of(fields["stamp_ns"], values, fields["valid"])
+        return Input(self.now_ns, reading, frames, self.faults, gyro)
 
 
 class FramesMessage(TickMessage):
@@ -223,14 +225,9 @@ class FramesMessage(TickMessage):
 class ReadingMessage(TickMessage):
     """What the two kinds of odometry share: its stamp, and the frames that showed nothing."""
 
-    VALUES: ClassVar[tuple[str, ...]]  # the fields that were read, in the order of `values`
     stamp_ns: Stamp
     valid: Flag
     frames: list[FrameMessage] = Field(default_factory=list)
-
-    def _reading(self) -> Reading:
-        values = [getattr(self, name) for name in self.VALUES]
-        return reading_of(self.stamp_ns, values, self.valid)
 
 
 class OdometryMessage(ReadingMessage):
