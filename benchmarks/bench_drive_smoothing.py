@@ -16,7 +16,7 @@ import numpy as np  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
 from jaxnav.recordings.drive_events import DriveEvents  # noqa: E402
 from jaxnav.recordings.drive_setup import DriveSetup  # noqa: E402
-from jaxnav.recordings.other.smoothed_drive import DriveTrack, distances, smooth_drive  # noqa: E402
+from jaxnav.recordings.other.localise import DriveTrack, distances, smooth_drive  # noqa: E402
 from jaxnav.vehicles.conformance.faults import WAYPOINTS_M  # noqa: E402
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, drive  # noqa: E402
 from jaxnav.vehicles.world import SimWorld  # noqa: E402

@@ -20,13 +20,7 @@ if TYPE_CHECKING:
     from jaxnav.files.rigs import save_rig
     from jaxnav.files.topics import TopicMap, load_topics
     from jaxnav.files.vehicles import Route, load_car, load_route, load_vehicle, save_vehicle
-    from jaxnav.files.writing import (
-        atomic_path,
-        atomic_write,
-        output_folder,
-        write_json,
-        write_tum,
-    )
+    from jaxnav.files.writing import atomic_path, atomic_write, output_folder, write_json, write_tum
 
 __all__ = [
     "Params",

@@ -16,9 +16,9 @@ calib.io and OpenCV before 4.6 print it. An aprilgrid has also `spacing`, in sid
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from jaxnav.errors import BadInput
 from jaxnav.files.ranges import within
@@ -39,8 +39,10 @@ _ARGUMENTS = {
 }
 
 
-class _Own(Entry):
-    """A board in our own file."""
+class BoardFile(Entry):
+    """A board in our own file, with the fields of its kind."""
+
+    board: str
 
     def figures(self) -> dict[str, Any]:
         """The arguments of `jaxnav.calibrate.board.board.Board`."""
@@ -48,58 +50,33 @@ class _Own(Entry):
         return {"columns": 1, "rows": 1} | own
 
 
-class Charuco(_Own):
-    """A board file's chessboard with markers in its white squares."""
-
-    board: Literal["charuco"]
-    columns: Squares
-    rows: Squares
-    square_m: Size
-    marker_m: Size
-    family: Text
-    first_id: Count = 0
-    legacy: Annotated[bool, Field(strict=True)] = False
-
-
-class Aprilgrid(_Own):
-    """A board file's grid of tags with black squares between them."""
-
-    board: Literal["aprilgrid"]
-    columns: Squares
-    rows: Squares
-    tag_m: Size
-    spacing: Spacing
-    family: Text = "tag36h11"
-    first_id: Count = 0
-    border_cells: Annotated[int, Field(strict=True, ge=1, le=2)] = 2
-
-
-class Chessboard(_Own):
-    """A board file's chessboard of black and white squares."""
-
-    board: Literal["chessboard"]
-    columns: Squares
-    rows: Squares
-    square_m: Size
-
-
-class Circles(_Own):
-    """A board file's grid of discs, symmetric or not, as OpenCV counts them."""
-
-    board: Literal["circles", "asymmetric_circles"]
-    columns: Squares
-    rows: Squares
-    step_m: Size
-    diameter_m: Size
-
-
-class SingleMarker(_Own):
-    """A board file's single navigation marker."""
-
-    board: Literal["marker"]
-    size_m: Size
-    family: Text
-    first_id: Count
+_GRID: dict[str, Any] = {"columns": (Squares, ...), "rows": (Squares, ...)}
+_CIRCLES = _GRID | {"step_m": (Size, ...), "diameter_m": (Size, ...)}  # as OpenCV counts them
+_KINDS: dict[str, dict[str, Any]] = {
+    "charuco": _GRID
+    | {
+        "square_m": (Size, ...),
+        "marker_m": (Size, ...),
+        "family": (Text, ...),
+        "first_id": (Count, 0),
+        "legacy": (Annotated[bool, Field(strict=True)], False),
+    },
+    "aprilgrid": _GRID
+    | {
+        "tag_m": (Size, ...),
+        "spacing": (Spacing, ...),
+        "family": (Text, "tag36h11"),
+        "first_id": (Count, 0),
+        "border_cells": (Annotated[int, Field(strict=True, ge=1, le=2)], 2),
+    },
+    "chessboard": _GRID | {"square_m": (Size, ...)},
+    "marker": {"size_m": (Size, ...), "family": (Text, ...), "first_id": (Count, ...)},
+    "circles": _CIRCLES,
+    "asymmetric_circles": _CIRCLES,
+}
+_OWN: dict[str, type[BoardFile]] = {
+    kind: create_model(kind, __base__=BoardFile, **fields) for kind, fields in _KINDS.items()
+}
 
 
 class KalibrAprilgrid(ForeignEntry):
@@ -118,17 +95,6 @@ class KalibrCheckerboard(ForeignEntry):
     targetRows: Squares
     rowSpacingMeters: Size
     colSpacingMeters: Size
-
-
-BoardFile = Charuco | Aprilgrid | Chessboard | Circles | SingleMarker
-_OWN: dict[str, type[BoardFile]] = {
-    "charuco": Charuco,
-    "aprilgrid": Aprilgrid,
-    "chessboard": Chessboard,
-    "marker": SingleMarker,
-    "circles": Circles,
-    "asymmetric_circles": Circles,
-}
 
 
 def load_board(path: str | Path) -> BoardFile:
@@ -171,7 +137,7 @@ def _kalibr(path: Path, data: dict[str, Any]) -> BoardFile:
     kind = data["target_type"]
     if kind == "aprilgrid":
         grid = validate(KalibrAprilgrid, data, path)
-        return Aprilgrid.model_construct(
+        return _OWN["aprilgrid"].model_construct(
             board="aprilgrid",
             columns=grid.tagCols,
             rows=grid.tagRows,
@@ -187,6 +153,6 @@ def _kalibr(path: Path, data: dict[str, Any]) -> BoardFile:
         problem = f"must be as rowSpacingMeters ({square_m:g}): squares are square"
         raise BadInput(at(path, "colSpacingMeters"), problem)
     columns, rows = target.targetCols + 1, target.targetRows + 1
-    return Chessboard.model_construct(
+    return _OWN["chessboard"].model_construct(
         board="chessboard", columns=columns, rows=rows, square_m=square_m
     )

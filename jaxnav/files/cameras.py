@@ -19,9 +19,6 @@ from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import CameraEntry, RigFile, rig_left_out, rig_of
 from jaxnav.files.validation import at, validate
 
-ImageSizePx = tuple[int, int]  # width, height
-CameraFormat = Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
-
 
 @dataclass(frozen=True)
 class CameraFile:
@@ -33,7 +30,7 @@ class CameraFile:
         left_out: keys with values that no other file can be given.
     """
 
-    format: CameraFormat
+    format: Literal["jaxnav", "kalibr", "ros", "opencv", "photonvision"]
     cameras: tuple[CameraEntry, ...]
     left_out: tuple[str, ...]
 
@@ -56,7 +53,7 @@ def load_rig(path: str | Path) -> CameraRig:
     return rig_of(cameras)
 
 
-def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, ImageSizePx]:
+def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, tuple[int, int]]:
     """Read one camera and the size of its images in pixels (width, height).
 
     Args:
@@ -73,13 +70,7 @@ def load_camera(path: str | Path, name: str | None = None) -> tuple[Camera, Imag
 
 def load_camera_entry(path: Path, name: str | None) -> CameraEntry:
     """Read one camera with its name and sigmas; arguments and errors as of `load_camera`."""
-    data = read_mapping(path)
-    file = camera_file(path, data)
-    if file.format in ("jaxnav", "kalibr"):
-        return choose_camera(path, file.cameras, name)
-    if name is not None and name != data.get("camera_name"):
-        raise BadInput(path, f"holds one camera, and it is not named {name!r}")
-    return file.cameras[0]
+    return choose_camera(path, camera_file(path, read_mapping(path)).cameras, name)
 
 
 def camera_file(
@@ -109,7 +100,7 @@ def camera_file(
     for tool, model in ONE_CAMERA_FORMATS.items():
         if data.keys() & set(model.format_keys):
             stored = validate(model, data, path)
-            camera = stored.camera(path, _name(data.get("camera_name")) or path.stem)
+            camera = stored.camera(_name(data.get("camera_name")) or path.stem)
             return CameraFile(tool, (camera,), tuple(stored.left_out(data)))
     raise BadInput(
         path,

@@ -22,7 +22,13 @@ from pathlib import Path
 import jax
 import jaxlib.version
 
-from jaxnav.files.private import NotPrivateError, PrivateFolder
+from jaxnav.files.private import (
+    NotPrivateError,
+    private_folder,
+    read_private,
+    require_own_entries,
+    write_private,
+)
 
 FLAGS = {
     # Halves the time to compile a step and leaves the time to run it.
@@ -101,8 +107,7 @@ def known_flags(flags: dict[str, str]) -> dict[str, str]:
     folder = step_folder()
     with suppress(OSError, ValueError, NotPrivateError):
         if folder is not None:
-            with PrivateFolder(folder) as files:
-                kept = json.loads(files.read(name))
+            kept = json.loads(read_private(private_folder(folder) / name))
             if isinstance(kept, list):
                 return {flag: value for flag, value in flags.items() if flag in kept}
     try:
@@ -111,8 +116,7 @@ def known_flags(flags: dict[str, str]) -> dict[str, str]:
         return {}
     with suppress(OSError, NotPrivateError):
         if folder is not None:
-            with PrivateFolder(folder) as files:
-                files.write(name, json.dumps(sorted(known)).encode())
+            write_private(private_folder(folder) / name, json.dumps(sorted(known)).encode())
     return known
 
 
@@ -202,9 +206,8 @@ def _private(folder: Path) -> Path | None:
     The returned path contains no links.
     """
     try:
-        with PrivateFolder(folder, make=True) as files:
-            files.require_own_entries()
-            folder = files.path
+        folder = private_folder(folder, make=True)
+        require_own_entries(folder)
     except NotPrivateError as error:
         _refuse(str(error))
         return None

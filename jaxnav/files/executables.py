@@ -14,7 +14,6 @@ import inspect
 import os
 import pickle
 import platform
-import re
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
@@ -33,10 +32,10 @@ from jax.tree_util import PyTreeDef
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
-from jaxnav.files.private import NotPrivateError, PrivateFolder
+from jaxnav.files.private import NotPrivateError, private_folder, read_private, write_private
 
 _KEPT = 128  # the last used executables, some MB each, are kept
-_NAME = re.compile(r"[0-9a-f]{64}\.step")
+_NAMES = f"{64 * '[0-9a-f]'}.step"
 _LIBRARIES = ("jax", "jaxlib", "jaxlie", "equinox", "optimistix", "lineax")
 # Rooms that only call compiled programs or draw their results. A function's own file counts always.
 _WITHOUT = "calibrate", "commands", "experiments/studies", "pictures", "vehicles/conformance"
@@ -55,7 +54,7 @@ def keep_in(folder: Path | None) -> None:
     Args:
         folder: made if it is missing. Executables are run without a check: if anybody else may
             write to it, or to anything on its path, nothing is loaded and nothing is kept, see
-            `PrivateFolder`.
+            `private_folder`.
     """
     _folders[:] = [] if folder is None else [folder]
 
@@ -75,18 +74,9 @@ class kept:
         update_wrapper(self, function)
 
     def __call__(self, *arguments: PyTree, **static: Hashable) -> PyTree:
-        if not _folders or any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(arguments)):
-            return self.jitted(*arguments, **static)
-        return self.load(*arguments, **static)(*arguments)
-
-    def load(self, *arguments: PyTree, **static: Hashable) -> Callable[..., PyTree]:
-        """The executable for arguments of these shapes, which are all that it takes. Nothing runs.
-
-        Loaded if another process has kept it, else compiled and kept.
-        """
-        if not _folders:
-            return self.jitted.lower(*arguments, **static).compile()
         leaves, given = jax.tree.flatten(arguments)
+        if not _folders or any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self.jitted(*arguments, **static)
         kind = given, *static.items(), *((np.shape(x), jnp.result_type(x)) for x in leaves)
         if kind not in self._ready:
             self._ready[kind] = partial(self.jitted, **static)
@@ -95,7 +85,7 @@ class kept:
                     *program(self._function, arguments, _folders[-1], static),
                     [jnp.result_type(leaf) for leaf in leaves],
                 )
-        return self._ready[kind]
+        return self._ready[kind](*arguments)
 
 
 def _call(run: Run, structure: PyTreeDef, types: list[np.dtype]) -> Callable[..., PyTree]:
@@ -135,17 +125,16 @@ def program(
     Loaded if another process has kept it, else compiled and kept.
     """
     jax.monitoring.record_event(ASKED)
-    given, inputs = _asked(arguments)
-    name = _file(_name(function, given, static), inputs)
+    name, given, inputs = _asked(function, arguments, static)
     bound = partial(function, **static)
     return _loaded(folder, name, inputs) or _compiled(bound, folder, name, given, inputs)
 
 
 def is_kept(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path) -> bool:
     """Whether `program` finds the executable in the folder."""
-    given, inputs = _asked(arguments)
-    with suppress(OSError, NotPrivateError), PrivateFolder(folder) as files:
-        return files.holds(_file(_name(function, given, {}), inputs))
+    name, *_ = _asked(function, arguments, {})
+    with suppress(OSError, NotPrivateError):
+        return (private_folder(folder) / name).is_file()
     return False
 
 
@@ -161,15 +150,15 @@ def sources_digest(package: Path, without: tuple[str, ...]) -> str:
     return digest.hexdigest()
 
 
-def _asked(arguments: tuple[PyTree, ...]) -> tuple[PyTreeDef, list[jax.ShapeDtypeStruct]]:
+def _asked(
+    function: Callable[..., PyTree], arguments: tuple[PyTree, ...], static: Mapping[str, Hashable]
+) -> tuple[str, PyTreeDef, list[jax.ShapeDtypeStruct]]:
+    """The name of a program's file, and the structure and leaves of its arguments."""
     leaves, given = jax.tree.flatten(arguments)
-    return given, jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
-
-
-def _name(function: Callable[..., PyTree], given: PyTreeDef, static: Mapping[str, Hashable]) -> str:
-    own = Path(inspect.getfile(function)).read_bytes()
-    digest = hashlib.blake2b(own, digest_size=8).hexdigest()
-    return str((f"{function.__module__}.{function.__qualname__}", digest, given, *static.items()))
+    inputs = jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
+    own = hashlib.blake2b(Path(inspect.getfile(function)).read_bytes(), digest_size=8).hexdigest()
+    called = f"{function.__module__}.{function.__qualname__}", own
+    return _file(str((called, given, *static.items())), inputs), given, inputs
 
 
 def _compiled(
@@ -204,8 +193,7 @@ def _loaded(
     folder: Path, name: str, inputs: list[jax.ShapeDtypeStruct]
 ) -> tuple[Run, PyTreeDef] | None:
     try:
-        with PrivateFolder(folder) as files:
-            raw = files.read(name)
+        raw = read_private(private_folder(folder) / name)
         content = raw[_CHECKSUM_BYTES:]
         # Damaged machine code may do anything: it must not even be parsed.
         if hashlib.sha256(content).digest() != raw[:_CHECKSUM_BYTES]:
@@ -226,11 +214,12 @@ def _loaded(
 def _keep(folder: Path, name: str, raw: bytes) -> None:
     """Write an executable completely or not at all, and keep only the `_KEPT` last used ones."""
     # A full, foreign or unsafe disk is ignored: the program is in memory all the same.
-    with suppress(OSError, NotPrivateError), PrivateFolder(folder, make=True) as files:
-        files.write(name, raw)
-        ours = [name for name in files.names_by_use() if _NAME.fullmatch(name)]
-        for old in ours[:-_KEPT]:
-            files.remove(old)
+    with suppress(OSError, NotPrivateError):
+        path = private_folder(folder, make=True)
+        write_private(path / name, raw)
+        ours = sorted((old.lstat().st_mtime_ns, old) for old in path.glob(_NAMES))
+        for _, old in ours[:-_KEPT]:
+            old.unlink(missing_ok=True)
 
 
 def _file(structures: str, leaves: list[jax.ShapeDtypeStruct]) -> str:

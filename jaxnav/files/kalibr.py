@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from jaxnav.core.models.rig import PLACED_BY_CALIBRATION
 from jaxnav.errors import BadInput
@@ -28,6 +28,7 @@ from jaxnav.files.validation import (
     Number,
     QuaternionPose,
     Text,
+    Wrong,
     at,
     unread_keys,
     validate,
@@ -69,50 +70,33 @@ class KalibrCamera(ForeignEntry):
     tagtopic: Text | None = None  # TagSLAM's: where the detections of this camera are published
     rig_body: Text | None = None  # TagSLAM's: the body that carries it
 
-    @field_validator("intrinsics")
-    @classmethod
-    def _fu_fv_pu_pv(cls, intrinsics: list[float], info: Any) -> list[float]:
-        model = info.data.get("camera_model", "pinhole")
-        leading = _LEADING[model]
-        if len(intrinsics) != len(leading) + 4:
-            expected = " ".join([*leading, "fu fv pu pv"])
-            raise ValueError(f"must be {expected}, got {len(intrinsics)} numbers")
-        *coefficients, fu, fv, _, _ = intrinsics
-        if min(fu, fv) <= 0:
-            raise ValueError(f"the focal lengths must be > 0, got {[fu, fv]}")
-        if leading and (problem := coefficients_problem(_SPHERES[model], coefficients)):
-            raise ValueError(problem)
-        return intrinsics
-
-    @field_validator("distortion_model")
-    @classmethod
-    def _known_lens(cls, model: str, info: Any) -> str:
-        camera_model = info.data.get("camera_model", "pinhole")
-        known = _BENT_BY[camera_model]
-        if model not in known:
-            of_which = "" if camera_model == "pinhole" else f" for camera_model {camera_model}"
-            raise ValueError(f"must be one of {', '.join(known)}{of_which}, got {model!r}")
-        return model
-
-    @field_validator("distortion_coeffs")
-    @classmethod
-    def _as_many_as_it_has(cls, coefficients: list[float], info: Any) -> list[float]:
-        # Kalibr writes four for both lenses; for `none` some tools write zeros.
-        lens = _LENS[info.data.get("distortion_model", "none")]
-        if lens == "none" and any(coefficients):
-            raise ValueError("must be empty for distortion_model none")
-        allowed = {"none": [len(coefficients)], "radtan": [4, 5], "equidistant": [4]}[lens]
-        if info.data.get("camera_model") == "omni":
-            allowed = allowed[:1]
-        if len(coefficients) not in allowed:
-            expected = " or ".join(map(str, allowed))
-            raise ValueError(f"must have {expected} numbers, got {len(coefficients)}")
-        return coefficients
-
     @model_validator(mode="after")
-    def _fits_the_images(self) -> "KalibrCamera":
-        if problem := pinhole_problem(self.intrinsics[-4:], self.resolution):
-            raise ValueError(f"intrinsics, resolution: {problem}")
+    def _agrees(self) -> "KalibrCamera":
+        model, leading = self.camera_model, _LEADING[self.camera_model]
+        if len(self.intrinsics) != len(leading) + 4:
+            expected = " ".join([*leading, "fu fv pu pv"])
+            problem = f"must be {expected}, got {len(self.intrinsics)} numbers"
+            raise Wrong("intrinsics", problem)
+        *coefficients, fu, fv, _, _ = self.intrinsics
+        if min(fu, fv) <= 0:
+            raise Wrong("intrinsics", f"the focal lengths must be > 0, got {[fu, fv]}")
+        if leading and (wrong := coefficients_problem(_SPHERES[model], coefficients)):
+            raise Wrong("intrinsics", wrong)
+        if (bent_by := self.distortion_model) not in (known := _BENT_BY[model]):
+            of_which = "" if model == "pinhole" else f" for camera_model {model}"
+            problem = f"must be one of {', '.join(known)}{of_which}, got {bent_by!r}"
+            raise Wrong("distortion_model", problem)
+        # Kalibr writes four coefficients for both lenses; for `none` some tools write zeros.
+        count, lens = len(self.distortion_coeffs), _LENS[bent_by]
+        if lens == "none" and any(self.distortion_coeffs):
+            raise Wrong("distortion_coeffs", "must be empty for distortion_model none")
+        allowed = {"none": [count], "radtan": [4, 5], "equidistant": [4]}[lens]
+        allowed = allowed[:1] if model == "omni" else allowed
+        if count not in allowed:
+            problem = f"must have {' or '.join(map(str, allowed))} numbers, got {count}"
+            raise Wrong("distortion_coeffs", problem)
+        if wrong := pinhole_problem(self.intrinsics[-4:], self.resolution):
+            raise ValueError(f"intrinsics, resolution: {wrong}")
         return self
 
     def camera(

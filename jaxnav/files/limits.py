@@ -32,9 +32,7 @@ MESSAGE_BYTES = 4 * MIB  # of a message that is no picture: one of 4096 markers 
 CONNECTIONS = 4096  # of a bag: one a topic and publisher
 INDEX_ENTRIES = 2_000_000  # of a bag, 200 bytes each: half an hour of 1 kHz
 DEFINITION_BYTES = 64 * 2**10  # of a type of message; PX4's longest have 10
-LIST_LENGTH = (
-    1000  # of a list of messages that a definition declares; covariances are plain numbers
-)
+LIST_LENGTH = 1000  # of messages in one that a definition declares; covariances are plain numbers
 SQLITE_STEPS = 400_000_000  # to open a .db3: 30 each message, 30 ns each step
 # Of our own recordings, with their outcomes: an hour at 130 inputs a second. 1.7 kB of memory each.
 MCAP_MESSAGES = 1_000_000

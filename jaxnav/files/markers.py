@@ -23,10 +23,11 @@ from pydantic import Field, field_validator, model_validator
 from jaxnav.core.models.markers import CORNER_SIGNS, FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.origin import Origin, opposite, origin_near, poses_in_world
 from jaxnav.files import poses
-from jaxnav.files.provenance import Calibrated
-from jaxnav.files.rigs import pose_entry, with_provenance
-from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, read
-from jaxnav.files.writing import atomic_write, yaml_text
+from jaxnav.files.provenance import Calibrated, file_text
+from jaxnav.files.reading import first_repeated
+from jaxnav.files.rigs import pose_entry
+from jaxnav.files.validation import Count, Entry, Place, Point, Pose, Size, Text, Wrong, read
+from jaxnav.files.writing import atomic_write
 
 # The most that a corner may be off the best square, in sides: a tape measure's error.
 _MAX_CORNER_ERROR = 0.03
@@ -49,39 +50,27 @@ class MarkerEntry(Entry):
     T_world_marker: Pose | None = None
     sigma: MarkerSigma | None = None
 
-    @field_validator("family")
-    @classmethod
-    def _known(cls, family: str) -> str:
-        if family not in FAMILY_SIZES:
-            raise ValueError(f"unknown {family!r}: expected one of {', '.join(FAMILY_SIZES)}")
-        return family
-
-    @field_validator("id")
-    @classmethod
-    def _in_family(cls, marker_id: int, info: Any) -> int:
-        family = info.data.get("family")
-        if family and marker_id >= FAMILY_SIZES[family]:
-            raise ValueError(f"{family} has ids 0 to {FAMILY_SIZES[family] - 1}, got {marker_id}")
-        return marker_id
-
-    @field_validator("corners_world_m")
-    @classmethod
-    def _a_square(cls, corners: list[list[float]] | None, info: Any) -> list[list[float]] | None:
-        if corners is not None and "size_m" in info.data:
-            fit_square(np.array(corners), info.data["size_m"])
-        return corners
-
     @model_validator(mode="after")
-    def _placed_once(self) -> "MarkerEntry":
+    def _agrees(self) -> "MarkerEntry":
+        if self.family not in FAMILY_SIZES:
+            problem = f"unknown {self.family!r}: expected one of {', '.join(FAMILY_SIZES)}"
+            raise Wrong("family", problem)
+        if self.id >= (count := FAMILY_SIZES[self.family]):
+            raise Wrong("id", f"{self.family} has ids 0 to {count - 1}, got {self.id}")
         if (self.corners_world_m is None) == (self.T_world_marker is None):
             raise ValueError("needs exactly one of corners_world_m, T_world_marker")
+        self.placed()
         return self
 
     def placed(self) -> "MarkerEntry":
         """The same marker, with `T_world_marker` for its place and no sigma."""
         T_world_marker = self.T_world_marker
         if self.corners_world_m is not None:
-            T_world_marker = pose_entry(fit_square(np.array(self.corners_world_m), self.size_m))
+            try:
+                pose = fit_square(np.array(self.corners_world_m), self.size_m)
+            except ValueError as error:
+                raise Wrong("corners_world_m", str(error)) from None
+            T_world_marker = pose_entry(pose)
         return MarkerEntry.model_construct(
             id=self.id, family=self.family, size_m=self.size_m, T_world_marker=T_world_marker
         )
@@ -96,12 +85,8 @@ class MarkerFile(Entry):
     @field_validator("markers")
     @classmethod
     def _each_once(cls, markers: list[MarkerEntry]) -> list[MarkerEntry]:
-        seen = set()
-        for marker in markers:
-            key = (marker.family, marker.id)
-            if key in seen:
-                raise ValueError(f"marker {marker.id} of {marker.family} is in the map twice")
-            seen.add(key)
+        if twice := first_repeated((marker.id, marker.family) for marker in markers):
+            raise ValueError("marker {} of {} is in the map twice".format(*twice))
         return markers
 
     def map(self, origin_m: Origin | None = None) -> MarkerMap:
@@ -167,7 +152,7 @@ def save_markers(
     for entry, sigma in zip(data["markers"], sigmas or (), strict=bool(sigmas)):
         if sigma is not None:
             entry["sigma"] = sigma.model_dump()
-    atomic_write(path, yaml_text(with_provenance(data, calibrated)))
+    atomic_write(path, file_text(data, calibrated))
 
 
 def marker_data(markers: MarkerMap) -> dict[str, Any]:
@@ -195,7 +180,7 @@ def _file_data(markers: Sequence[MarkerEntry]) -> dict[str, Any]:
 
 def markers_text(markers: Sequence[MarkerEntry]) -> str:
     """The markers as the text of a map file."""
-    return yaml_text(_file_data(markers))
+    return file_text(_file_data(markers))
 
 
 def markers_left_out(file: MarkerFile) -> list[str]:

@@ -14,10 +14,9 @@ PhotonVision keeps snapshots of the board and results from them (`observations`)
 
 import json
 from collections.abc import Container
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AliasChoices, Field, field_validator, model_validator
+from pydantic import AfterValidator, AliasChoices, Field, field_validator, model_validator
 
 from jaxnav.core.models.camera import LENS_COEFFICIENTS
 from jaxnav.errors import BadInput
@@ -30,7 +29,7 @@ from jaxnav.files.validation import (
     Number,
     Pixels,
     Text,
-    at,
+    Wrong,
     show_value,
     unread_keys,
 )
@@ -101,60 +100,56 @@ class MatrixCamera(ForeignEntry):
     read_keys: ClassVar[tuple[str, ...]]
     matrices: ClassVar[tuple[str, str]] = ("camera_matrix", "distortion_coefficients")
 
-    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+    def size_and_lens(self) -> tuple[list[int], Lens]:
         """Width and height of its images, px, and the kind of its lens: radtan for all of OpenCV's
-        that are no fisheye.
-
-        Raises:
-            BadInput: one line naming file and key.
-        """
+        that are no fisheye."""
         raise NotImplementedError
 
     def left_out(self, data: dict[str, Any]) -> list[str]:
         """The keys of the file that are not read and not empty, see `unread_keys`."""
         return unread_keys(data, self.read_keys)
 
-    def camera(self, path: Path, name: str) -> CameraEntry:
+    @model_validator(mode="after")
+    def _is_a_camera(self) -> Self:
+        """Calibrated, without skew, and with a lens of no more coefficients than ours."""
+        self.camera("")
+        return self
+
+    def camera(self, name: str) -> CameraEntry:
         """The camera under a given name.
 
         A radtan lens with more than five coefficients that matter is `rational`, with more than
         eight `thin_prism`.
-
-        Raises:
-            BadInput: one line naming file and key: not calibrated, skewed, or a lens with more
-                coefficients than ours.
         """
-        size_px, lens = self.size_and_lens(path)
+        size_px, lens = self.size_and_lens()
         K, coefficients = (getattr(self, field).data for field in self.matrices)
-        in_K, in_lens = (at(path, f"{field}.data") for field in self.matrices)
+        in_K, in_lens = (f"{field}.data" for field in self.matrices)
         if len(K) != 9:
-            raise BadInput(in_K, f"must be 3 x 3, got {len(K)} numbers")
+            raise Wrong(in_K, f"must be 3 x 3, got {len(K)} numbers")
         if K[0] == 0:
-            raise BadInput(f"{in_K}[0]", "is 0: this camera has not been calibrated")
+            raise Wrong(f"{in_K}[0]", "is 0: this camera has not been calibrated")
         for index in (0, 4):
             if K[index] <= 0:
-                problem = f"the focal length must be > 0, got {K[index]:g}"
-                raise BadInput(f"{in_K}[{index}]", problem)
+                raise Wrong(f"{in_K}[{index}]", f"the focal length must be > 0, got {K[index]:g}")
         if any(abs(K[index]) > 1e-9 * K[0] for index in (1, 3, 6, 7)) or K[8] != 1:
-            raise BadInput(in_K, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
+            raise Wrong(in_K, "must be fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
         pinhole_px = [K[index] for index in (0, 4, 2, 5)]
         if wrong := pinhole_problem(pinhole_px, size_px):
-            sizes = "image_width and image_height, or resolution"
-            raise BadInput(in_K, f"{wrong} ({sizes})")
+            raise Wrong(in_K, f"{wrong} (image_width and image_height, or resolution)")
         if lens == "radtan" and any(coefficients[5:]):
             lens = "thin_prism" if any(coefficients[8:]) else "rational"
         most = LENS_COEFFICIENTS[lens]
         if lens == "equidistant" and len(coefficients) != 4:
             problem = f"must be k1 k2 k3 k4 for a fisheye lens, got {len(coefficients)}"
-            raise BadInput(in_lens, problem)
+            raise Wrong(in_lens, problem)
         if any(coefficients[most:]):
-            raise BadInput(
+            raise Wrong(
                 in_lens, "has tilt coefficients that are not zero: calibrate again with twelve "
                 "(thin_prism), eight (rational) or five (plumb_bob, radtan)",
             )  # fmt: skip
         for index, value in enumerate(coefficients[:most]):
             if wrong := problem_of("distortion", value):
-                raise BadInput(f"{in_lens}[{index}]", wrong)
+                raise Wrong(f"{in_lens}[{index}]", wrong)
         return CameraEntry.create(name, lens, pinhole_px, coefficients[:most], size_px)
 
 
@@ -168,10 +163,10 @@ class CameraInfo(MatrixCamera):
     distortion_model: Text
     distortion_coefficients: MatrixEntry
 
-    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+    def size_and_lens(self) -> tuple[list[int], Lens]:
         if self.distortion_model not in _LENS:
             problem = f"must be one of {', '.join(_LENS)}, got {self.distortion_model!r}"
-            raise BadInput(at(path, "distortion_model"), problem)
+            raise Wrong("distortion_model", problem)
         return [self.image_width, self.image_height], _LENS[self.distortion_model]
 
     def left_out(self, data: dict[str, Any]) -> list[str]:
@@ -204,31 +199,30 @@ class OpenCVCamera(MatrixCamera):
     ]
     fisheye_model: Annotated[int, Field(strict=True, ge=0, le=1)] = 0
 
-    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+    def size_and_lens(self) -> tuple[list[int], Lens]:
         lens: Lens = "equidistant" if self.fisheye_model else "radtan"
         if self.image_size is not None:
             return self.image_size, lens
         if self.image_width is None or self.image_height is None:
             missing = "image_width" if self.image_width is None else "image_height"
-            raise BadInput(at(path, missing), "missing: for which image size are these figures?")
+            raise Wrong(missing, "missing: for which image size are these figures?")
         return [self.image_width, self.image_height], lens
 
 
-_PhotonVisionSide = Annotated[float, Field(strict=True, ge=1, le=65536)]
+def _whole(value: float) -> int:
+    if value != int(value):
+        raise ValueError(f"must be a whole number of pixels, got {value:g}")
+    return int(value)
+
+
+_Side = Annotated[float, Field(strict=True, ge=1, le=65536), AfterValidator(_whole)]
 
 
 class Resolution(ForeignEntry):
     """PhotonVision's image size."""
 
-    width: _PhotonVisionSide
-    height: _PhotonVisionSide
-
-    @field_validator("width", "height")
-    @classmethod
-    def _whole(cls, value: float) -> float:
-        if value != int(value):
-            raise ValueError(f"must be a whole number of pixels, got {value:g}")
-        return value
+    width: _Side
+    height: _Side
 
 
 class PhotonVisionCamera(MatrixCamera):
@@ -242,10 +236,9 @@ class PhotonVisionCamera(MatrixCamera):
     distCoeffs: Annotated[MatrixEntry, Field(validation_alias=AliasChoices(*_PHOTONVISION_D))]
     lensmodel: Text = _PHOTONVISION_LENS
 
-    def size_and_lens(self, path: Path) -> tuple[list[int], Lens]:
+    def size_and_lens(self) -> tuple[list[int], Lens]:
         if "OPENCV" not in self.lensmodel:
-            problem = f"must be an OpenCV lens, got {self.lensmodel!r}"
-            raise BadInput(at(path, "lensmodel"), problem)
+            raise Wrong("lensmodel", f"must be an OpenCV lens, got {self.lensmodel!r}")
         return [int(self.resolution.width), int(self.resolution.height)], "radtan"
 
 

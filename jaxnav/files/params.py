@@ -27,13 +27,7 @@ from jaxtyping import Float
 from pydantic import Field
 
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.parameters import (
-    TUNABLES,
-    Tunable,
-    allowed_shapes,
-    parameters_of,
-    with_parameters,
-)
+from jaxnav.core.parameters import TUNABLES, Tunable, allowed_shapes, parameters_of, with_parameters
 from jaxnav.errors import BadInput
 from jaxnav.files.validation import Entry, at, read, show_value, validate
 from jaxnav.files.writing import atomic_write, plain_data, yaml_text
@@ -92,7 +86,7 @@ class Params:
                 nearest = ", ".join(get_close_matches(name, TUNABLES, cutoff=0))
                 problem = f"unknown: of {len(TUNABLES)} names the nearest are {nearest}"
                 raise BadInput(where, problem)
-            params.values[name] = param_array(value, where, TUNABLES[name])
+            params.values[name] = _array(value, where, TUNABLES[name])
         return params
 
     def where(self, name: str) -> str:
@@ -210,20 +204,9 @@ def _counted(shape: tuple[int, ...]) -> str:
     return f"{shape[0]} rows of {shape[1]}"
 
 
-def param_array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "..."]:
-    """Check a parameter's numbers and return them unchanged as an array (), (d,) or (d, d).
-
-    Every number must be positive, and a matrix a covariance. One that only bounds what is believed
-    may be infinite. The navigator decides how many entries there must be.
-
-    Args:
-        value: plain, or an array.
-        where: file and key, for the message.
-        tunable: what the parameter may be.
-
-    Raises:
-        BadInput: the value is anything else; names its place in the list.
-    """
+def _array(value: Any, where: str, tunable: Tunable) -> Float[np.ndarray, "..."]:
+    """A parameter's numbers, checked: positive, and a matrix a covariance. One that only bounds
+    what is believed may be infinite. The navigator decides how many entries there must be."""
     value = _plain(value)
     if tunable.guard and isinstance(value, float) and not math.isfinite(value):
         if value != math.inf:

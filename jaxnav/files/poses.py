@@ -45,28 +45,22 @@ def check_quaternion(wxyz: list[float]) -> list[float]:
     return wxyz
 
 
-def pose_from_matrix(
-    T: Sequence[Sequence[float]] | np.ndarray,
-) -> Float[np.ndarray, " 7"]:
+def pose_from_matrix(T: Sequence[Sequence[float]] | np.ndarray) -> Float[np.ndarray, " 7"]:
     """The pose (7,) of a 4x4 that `check_matrix` accepts; R becomes the nearest rotation."""
     T = np.asarray(T, float)
     return _pose(Rotation.from_matrix(T[:3, :3]), T[:3, 3])
 
 
-def pose_from_quaternion(
-    wxyz: Sequence[float] | np.ndarray, xyz_m: Sequence[float] | np.ndarray
-) -> Float[np.ndarray, " 7"]:
-    """The pose (7,), normalised only if the length is off by more than float32's rounding."""
-    q = np.asarray(wxyz, float)
-    length = np.linalg.norm(q)
-    return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, np.asarray(xyz_m, float)])
-
-
 def pose_as_read(written: Any) -> Float[np.ndarray, " 7"]:
-    """The pose (7,) of one as a file has it: the rows of a 4x4, or `wxyz` and `xyz_m`."""
+    """The pose (7,) of one as a file has it: the rows of a 4x4, or `wxyz` and `xyz_m`.
+
+    A quaternion is normalised only if its length is off by more than float32's rounding.
+    """
     if isinstance(written, list):
         return pose_from_matrix(written)
-    return pose_from_quaternion(written.wxyz, written.xyz_m)
+    q = np.asarray(written.wxyz, float)
+    length = np.linalg.norm(q)
+    return np.concatenate([q if abs(length - 1) < 1e-6 else q / length, written.xyz_m])
 
 
 def matrix_as_read(written: Any) -> Float[np.ndarray, "4 4"]:
@@ -98,8 +92,7 @@ def _pose(rotation: Rotation, xyz_m: Sequence[float] | np.ndarray) -> Float[np.n
 
 
 def transform(
-    R: Float[np.ndarray, "*batch 3 3"],
-    translation_m: np.ndarray | Sequence[float],
+    R: Float[np.ndarray, "*batch 3 3"], translation_m: np.ndarray | Sequence[float]
 ) -> Float[np.ndarray, "*batch 4 4"]:
     """The 4x4 of a rotation (..., 3, 3) and a translation (..., 3), m."""
     T = np.zeros((*R.shape[:-2], 4, 4))

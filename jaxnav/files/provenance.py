@@ -1,4 +1,4 @@
-"""The provenance of calibrated figures, as their file states it.
+"""The provenance of calibrated figures, at the head of their file.
 
 calibrated:
   date: 2026-05-17
@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Shaped
@@ -18,6 +18,7 @@ from pydantic import Field
 
 from jaxnav.files.reading import open_file
 from jaxnav.files.validation import Entry, Text
+from jaxnav.files.writing import yaml_text
 
 
 class Calibrated(Entry):
@@ -26,6 +27,11 @@ class Calibrated(Entry):
     date: Annotated[str, Field(strict=True, pattern=r"^\d{4}-\d\d-\d\d$")]  # UTC
     tool: Text
     data_sha256: Annotated[str, Field(strict=True, pattern=r"^[0-9a-f]{64}$")]
+
+
+def file_text(data: dict[str, Any], calibrated: Calibrated | None = None) -> str:
+    """Data as the text of a file, headed by its provenance if there is one."""
+    return yaml_text(data if calibrated is None else {"calibrated": calibrated.model_dump()} | data)
 
 
 def calibrated_now(tool: str, data: Iterable[Path | Shaped[np.ndarray, "..."]]) -> Calibrated:

@@ -9,8 +9,8 @@ import json
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
@@ -66,12 +66,17 @@ def open_file(path: Path) -> BufferedReader:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming(path: str | Path, problem: str, also: type[Exception] = OSError) -> Iterator[None]:
+    """Turn the system's errors about a file, and others, into `BadInput`."""
     try:
         yield
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+    except (OSError, also) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise BadInput(path, f"can't be read: {reason.lower()}") from None
+        raise BadInput(path, f"{problem}: {reason.lower()}") from None
+
+
+def _naming(path: Path) -> AbstractContextManager[None]:
+    return naming(path, "can't be read", ValueError)  # ValueError: a NUL in the name
 
 
 def read_text(path: Path, max_bytes: int) -> str:
@@ -131,11 +136,14 @@ def parse_json(path: Path, text: str) -> Any:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    mapping = dict(pairs)
-    if len(mapping) < len(pairs):
-        times = Counter(key for key, _ in pairs)
-        raise ValueError(f"duplicate key {next(key for key in times if times[key] > 1)!r}")
+    if len(mapping := dict(pairs)) < len(pairs):
+        raise ValueError(f"duplicate key {first_repeated(key for key, _ in pairs)!r}")
     return mapping
+
+
+def first_repeated(things: Iterable[Hashable]) -> Any:
+    """The first thing that is there twice; None: there is none."""
+    return next((thing for thing, count in Counter(things).items() if count > 1), None)
 
 
 # libyaml: a tenth of the time. A PyYAML may have been built without it.

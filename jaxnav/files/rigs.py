@@ -40,8 +40,9 @@ from jaxnav.core.models.rig import PLACED_BY_HAND, UNKNOWN_TIMING, CameraRig, Ti
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
-from jaxnav.files.provenance import Calibrated
+from jaxnav.files.provenance import Calibrated, file_text
 from jaxnav.files.ranges import Range, pinhole_problem, within
+from jaxnav.files.reading import first_repeated
 from jaxnav.files.validation import (
     NAME_PATTERN,
     AngleDeg,
@@ -56,18 +57,12 @@ from jaxnav.files.validation import (
     Positive,
     PositivePair,
     QuaternionPose,
+    Wrong,
 )
-from jaxnav.files.writing import atomic_write, yaml_text
+from jaxnav.files.writing import atomic_write
 
 Lens = Literal[
-    "none",
-    "radtan",
-    "rational",
-    "thin_prism",
-    "equidistant",
-    "omni",
-    "double_sphere",
-    "eucm",
+    "none", "radtan", "rational", "thin_prism", "equidistant", "omni", "double_sphere", "eucm"
 ]
 # One that is larger says that nobody knows where the camera is, or was written in another unit.
 _MOST_SIGMA_M, *_, _MOST_SIGMA_RAD = TUNABLES["rig.extrinsics_sigma"].most
@@ -138,23 +133,16 @@ class CameraEntry(Entry):
     roll_deg: AngleDeg | None = None
     sigma: CameraSigma | None = None
 
-    @field_validator("distortion")
-    @classmethod
-    def _as_the_lens_counts(cls, coefficients: list[float], info: Any) -> list[float]:
-        lens = info.data.get("lens", "none")
-        most = LENS_COEFFICIENTS[lens]
-        allowed = {0, most, 4} if lens == "radtan" else {0, most}
-        if len(coefficients) not in allowed:
-            expected = " or ".join(str(count) for count in sorted(allowed - {0}) or [0])
-            raise ValueError(
-                f"must have {expected} coefficients for the lens {lens}, got {len(coefficients)}"
-            )
-        if problem := coefficients_problem(lens, coefficients):
-            raise ValueError(problem)
-        return coefficients
-
     @model_validator(mode="after")
-    def _placed_once(self) -> "CameraEntry":
+    def _agrees(self) -> "CameraEntry":
+        lens, count, most = self.lens, len(self.distortion), LENS_COEFFICIENTS[self.lens]
+        allowed = {0, most, 4} if lens == "radtan" else {0, most}
+        if count not in allowed:
+            expected = " or ".join(str(count) for count in sorted(allowed - {0}) or [0])
+            problem = f"must have {expected} coefficients for the lens {lens}, got {count}"
+            raise Wrong("distortion", problem)
+        if wrong := coefficients_problem(lens, self.distortion):
+            raise Wrong("distortion", wrong)
         places = ("T_vehicle_camera", "T_camera_vehicle", "position_m")
         given = [key for key in places if getattr(self, key) is not None]
         if len(given) != 1:
@@ -165,13 +153,8 @@ class CameraEntry(Entry):
             raise ValueError(f"{angles[0]} goes with position_m, not with {given[0]}")
         if given == ["position_m"] and self.yaw_deg is None:
             raise ValueError("position_m needs yaw_deg (0 looks forward, 90 to the left)")
-        return self
-
-    @model_validator(mode="after")
-    def _fits_the_images(self) -> "CameraEntry":
-        problem = pinhole_problem([*self.focal_px, *self.center_px], self.image_size_px)
-        if problem:
-            raise ValueError(f"focal_px, center_px, image_size_px: {problem}")
+        if wrong := pinhole_problem([*self.focal_px, *self.center_px], self.image_size_px):
+            raise ValueError(f"focal_px, center_px, image_size_px: {wrong}")
         return self
 
     @staticmethod
@@ -256,9 +239,7 @@ class RigFile(Entry):
     @field_validator("cameras")
     @classmethod
     def _names_differ(cls, cameras: list[CameraEntry]) -> list[CameraEntry]:
-        names = [camera.name for camera in cameras]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
+        if twice := first_repeated(camera.name for camera in cameras):
             raise ValueError(f"the name {twice!r} is used twice")
         return cameras
 
@@ -298,24 +279,10 @@ def save_rig(
     Raises:
         BadInput: the file can't be written.
     """
-    atomic_write(path, rig_file_text(rig, calibrated, sigmas))
-
-
-def rig_file_text(
-    rig: CameraRig,
-    calibrated: Calibrated | None = None,
-    sigmas: Sequence[CameraSigma] | None = None,
-) -> str:
-    """What `save_rig` writes."""
     data = rig_data(rig)
     for entry, sigma in zip(data["cameras"], sigmas or (), strict=bool(sigmas)):
         entry["sigma"] = entry.get("sigma", {}) | sigma.model_dump(exclude_none=True)
-    return yaml_text(with_provenance(data, calibrated))
-
-
-def with_provenance(data: dict[str, Any], calibrated: Calibrated | None) -> dict[str, Any]:
-    """The content of a file, headed by its provenance if there is one."""
-    return data if calibrated is None else {"calibrated": calibrated.model_dump()} | data
+    atomic_write(path, file_text(data, calibrated))
 
 
 def rig_data(rig: CameraRig) -> dict[str, Any]:
@@ -361,7 +328,7 @@ def rig_text(cameras: Sequence[CameraEntry]) -> str:
             raise BadInput(where, problem)
         if not re.match(NAME_PATTERN, camera.name):
             raise BadInput(where, "can't be a camera's name (a letter first): give --camera-name")
-    return yaml_text(_file_data(cameras))
+    return file_text(_file_data(cameras))
 
 
 def rig_left_out(file: RigFile) -> list[str]:

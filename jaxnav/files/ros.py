@@ -35,7 +35,7 @@ from pydantic import Field, model_validator
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
-from jaxnav.files.topics import OdometrySigma, TopicMap, read_topics
+from jaxnav.files.topics import OdometrySigma, TopicMap
 from jaxnav.files.validation import (
     Entry,
     MountPose,
@@ -142,9 +142,7 @@ class RosFile(TopicMap):
 
     def with_markers(self, path: str) -> "RosFile":
         """The same with another marker file, whose path counts from this file's folder."""
-        changed = self.model_copy(update={"markers": path})
-        changed._path = self._path
-        return changed
+        return self.model_copy(update={"markers": path})
 
     def options(self, drives: bool, sim_time: bool) -> dict[str, str]:
         """The options of the plug-ins `ros2` of vehicle and cameras.
@@ -181,4 +179,4 @@ def load_ros(path: str | Path) -> RosFile:
     Raises:
         BadInput: one line naming file and key.
     """
-    return read_topics(RosFile, Path(path))
+    return RosFile.load(Path(path))

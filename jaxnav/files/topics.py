@@ -15,11 +15,11 @@ with `bottom_left`; one made for OpenCV's, as jaxnav's own detectors see it, wit
 import dataclasses
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from jaxtyping import Float
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from jaxnav.core.models.conventions import FirstCorner
 from jaxnav.core.models.imu import PRESETS, ImuNoise
@@ -31,6 +31,7 @@ from jaxnav.core.models.vehicle import (
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.files import poses
 from jaxnav.files.ranges import within
+from jaxnav.files.reading import first_repeated
 from jaxnav.files.validation import (
     CornerSigma,
     Entry,
@@ -39,6 +40,7 @@ from jaxnav.files.validation import (
     NonNegative,
     Number,
     Positive,
+    Wrong,
     read,
 )
 
@@ -162,35 +164,32 @@ class TopicMap(Entry):
     corner_sigma_px: CornerSigma = 0.3
     first_corner: FirstCorner = "bottom_left"
 
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read such a file; see `load_topics`."""
+        topics = read(path, cls)
+        topics._path = path
+        return topics
+
     @property
     def path(self) -> Path:
         """The file, for messages."""
         return self._path
 
-    @field_validator("cameras")
-    @classmethod
-    def _topics_differ(cls, cameras: dict[str, str]) -> dict[str, str]:
-        topics = [topic.strip("/") for topic in cameras.values()]
-        if len(set(topics)) < len(topics):
-            twice = next(topic for topic in topics if topics.count(topic) > 1)
-            raise ValueError(f"the topic {twice} is given to two cameras")
-        return cameras
-
-    @field_validator("odometry")
-    @classmethod
-    def _not_a_camera(cls, odometry: str | None, info: Any) -> str | None:
-        for camera, topic in info.data.get("cameras", {}).items():
-            if odometry is not None and topic.strip("/") == odometry.strip("/"):
-                raise ValueError(f"{topic} is the topic of the camera {camera!r} already")
-        return odometry
+    @model_validator(mode="after")
+    def _each_topic_once(self) -> Self:
+        if twice := first_repeated(topic.strip("/") for topic in self.cameras.values()):
+            raise Wrong("cameras", f"the topic {twice} is given to two cameras")
+        for camera, topic in self.cameras.items():
+            if same_topic(topic, self.odometry):
+                problem = f"{topic} is the topic of the camera {camera!r} already"
+                raise Wrong("odometry", problem)
+        return self
 
 
 def same_topic(topic: str, other: str | None) -> bool:
     """Whether two spellings of a topic's name mean the same topic."""
     return other is not None and topic.strip("/") == other.strip("/")
-
-
-Topics = TypeVar("Topics", bound=TopicMap)
 
 
 def load_topics(path: str | Path) -> TopicMap:
@@ -199,11 +198,4 @@ def load_topics(path: str | Path) -> TopicMap:
     Raises:
         BadInput: one line naming file and key.
     """
-    return read_topics(TopicMap, Path(path))
-
-
-def read_topics(kind: type[Topics], path: Path) -> Topics:
-    """Read a topic map, or a file that holds more than one; see `load_topics`."""
-    topics = read(path, kind)
-    topics._path = path
-    return topics
+    return TopicMap.load(Path(path))

@@ -104,6 +104,14 @@ MountPose = Annotated[_Pose, placed_within("mount_m")]  # on a vehicle
 Model = TypeVar("Model", bound=BaseModel)
 
 
+class Wrong(ValueError):
+    """What is wrong with one key of a mapping that a model checks as a whole."""
+
+    def __init__(self, key: str, problem: str):
+        super().__init__(problem)
+        self.key = key
+
+
 def validate(model: type[Model], data: Any, path: Path, prefix: str = "") -> Model:
     """Validate data as a model, or raise one line about the first error.
 
@@ -124,7 +132,9 @@ def validate(model: type[Model], data: Any, path: Path, prefix: str = "") -> Mod
     problem = _problem(first, model)
     if len(errors) > 1:
         problem += f" (and {len(errors) - 1} more)"
-    raise BadInput(at(path, prefix, _key(first["loc"], data)), problem)
+    of_whole = first.get("ctx", {}).get("error")
+    place = first["loc"] + ((of_whole.key,) if isinstance(of_whole, Wrong) else ())
+    raise BadInput(at(path, prefix, _key(place, data)), problem)
 
 
 def read(path: str | Path, model: type[Model]) -> Model:

@@ -19,44 +19,100 @@ exact.
 `resume: true` lets the vehicle, of any kind, drive on after a stop because something was late, once
 all has been well for 2 s. It is for the person who writes the file: no calibration writes it.
 
-A base that is no car, and a gyro: see `bases.py`.
+A base that is no car, and a gyro, of a car too:
+
+base: differential                     gyro:
+forward_limit_mps: 1.0                   class: consumer
+turn_limit_radps: 3.0                    delay_s: 0.004
+time_constant_s: 0.15
+
+`base` is differential or tracks; or omni, mecanum or swerve, which need a `left_limit_mps` as well.
+`sigma` says how well its odometry is known, by the names of `TWIST_ERRORS`; left out it is 3 % of
+the way, 5 % of the effective track width, 0.03 rad a metre of unequal wheels, and 20 ms between
+cameras and odometer. Four zeros make it exact.
+
+A gyro is that of its class, consumer where none is given, but for the figures that follow.
 """
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator
+from jaxtyping import Float
+from pydantic import Field, field_validator, model_validator
 
+from jaxnav.core.models.imu import GYROS, Gyro
 from jaxnav.core.models.origin import Origin, opposite, planar_in_world, points_in_world
-from jaxnav.core.models.vehicle import DEFAULT_SENSOR_SIGMA, SENSOR_ERRORS, TwistBase, Vehicle
+from jaxnav.core.models.vehicle import (
+    DEFAULT_SENSOR_SIGMA,
+    DEFAULT_TWIST_SIGMA,
+    SENSOR_ERRORS,
+    TWIST_ERRORS,
+    TwistBase,
+    Vehicle,
+)
 from jaxnav.core.parameters import TUNABLES
 from jaxnav.errors import BadInput
-from jaxnav.files.bases import ACKERMANN, BaseFile, GyroEntry, base_data, gyro_data
-from jaxnav.files.provenance import Calibrated
-from jaxnav.files.ranges import within
+from jaxnav.files.provenance import Calibrated, file_text
+from jaxnav.files.ranges import problem_of, within
 from jaxnav.files.reading import read_mapping
-from jaxnav.files.rigs import with_provenance
 from jaxnav.files.validation import (
     AngleDeg,
     Entry,
     FloorPlace,
     NonNegative,
     Number,
+    Place,
     Position,
     Positive,
     Radius,
+    Wrong,
     read,
     validate,
 )
-from jaxnav.files.writing import atomic_write, yaml_text
+from jaxnav.files.writing import atomic_write
 
 _MOST_SIGMA = TUNABLES["motion.vehicle.sensor_sigma"].most
 _NO_FIGURES = ("base", "calibrated", "gyro", "resume", "sigma")
+
+
+class GyroEntry(Entry):
+    """A gyro: its class, and what is known better."""
+
+    class_: Annotated[Literal["consumer", "tactical"], Field(alias="class")] = "consumer"
+    noise_density: Annotated[Positive, within("gyro_noise")] | None = None  # rad/s/sqrt(Hz)
+    bias_sigma_radps: Annotated[Positive, within("gyro_bias_radps")] | None = None
+    bias_walk: Annotated[Positive, within("gyro_walk")] | None = None  # rad/s/sqrt(s)
+    saturation_radps: Annotated[Positive, within("turn_limit_radps")] | None = None
+    scale_sigma: Annotated[NonNegative, Field(le=0.5)] | None = None
+    delay_s: Annotated[Number, within("delay_s")] | None = None
+    delay_sigma_s: Annotated[NonNegative, Field(le=0.5)] | None = None
+
+    def gyro(self) -> Gyro:
+        """The gyro."""
+        return dataclasses.replace(
+            GYROS[self.class_], **self.model_dump(exclude={"class_"}, exclude_none=True)
+        )
+
+
+def _require_small(sigma: dict[str, float], names: Iterable[str]) -> None:
+    for name, most in zip(names, _MOST_SIGMA, strict=True):
+        if sigma.get(name, 0.0) > most:
+            unit = {"rad": " rad", "s": " s"}.get(name.rsplit("_", 1)[-1], "")
+            raise Wrong("sigma", f"{name} must be at most {most:g}{unit}, got {sigma[name]:g}")
+
+
+def _sigmas(
+    given: Mapping[str, float], names: Iterable[str], defaults: Float[np.ndarray, " 4"]
+) -> Float[np.ndarray, " 4"] | None:
+    """The sigmas of a vehicle's sensors; None where all are exact."""
+    sigma = np.asarray([given.get(n, default) for n, default in zip(names, defaults, strict=True)])
+    return sigma if np.any(sigma) else None
 
 
 class VehicleFile(Entry):
@@ -78,22 +134,17 @@ class VehicleFile(Entry):
     sigma: dict[str, NonNegative] = Field(default_factory=dict)  # of the keys above, by their names
     resume: bool = False
 
-    @field_validator("sigma")
-    @classmethod
-    def _in_the_key_s_unit(cls, sigma: dict[str, float]) -> dict[str, float]:
-        for name, most in zip(SENSOR_ERRORS, _MOST_SIGMA, strict=True):
-            if sigma.get(name, 0.0) > most:
-                unit = {"rad": " rad", "s": " s"}.get(name.rsplit("_", 1)[-1], "")
-                raise ValueError(f"{name} must be at most {most:g}{unit}, got {sigma[name]:g}")
-        return sigma
+    @model_validator(mode="after")
+    def _agrees(self) -> Self:
+        _require_small(self.sigma, SENSOR_ERRORS)
+        return self
 
     def vehicle(self) -> Vehicle:
         """The vehicle, in the process's precision."""
         figures = self.model_dump(exclude={*_NO_FIGURES}, exclude_none=True)
-        defaults = zip(SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA, strict=True)
-        sigma = np.asarray([self.sigma.get(name, default) for name, default in defaults])
+        sigma = _sigmas(self.sigma, SENSOR_ERRORS, DEFAULT_SENSOR_SIGMA)
         gyro = None if self.gyro is None else self.gyro.gyro()
-        return Vehicle.create(**figures, sensor_sigma=sigma if np.any(sigma) else None, gyro=gyro)
+        return Vehicle.create(**figures, sensor_sigma=sigma, gyro=gyro)
 
 
 # Name -> its default; that of a correction corrects nothing.
@@ -104,21 +155,48 @@ _FIGURES = {
 }
 
 
+class BaseFile(Entry):
+    """A vehicle file of a base that is driven by a twist."""
+
+    base: Literal["differential", "tracks", "omni", "mecanum", "swerve"]
+    forward_limit_mps: Annotated[Positive, within("base_speed_mps")]
+    left_limit_mps: Annotated[Positive, within("base_speed_mps")] | None = None
+    turn_limit_radps: Annotated[Positive, within("turn_limit_radps")]
+    time_constant_s: Annotated[Positive, within("time_constant_s")]
+    sigma: dict[str, NonNegative] = Field(default_factory=dict)
+    gyro: GyroEntry | None = None
+    resume: bool = False
+
+    @model_validator(mode="after")
+    def _agrees(self) -> Self:
+        for name in self.sigma.keys() - TWIST_ERRORS:
+            raise Wrong("sigma", f"unknown {name}: expected {', '.join(TWIST_ERRORS)}")
+        _require_small(self.sigma, TWIST_ERRORS)
+        turns_alone = self.base in ("differential", "tracks")
+        if turns_alone and self.left_limit_mps is not None:
+            raise ValueError(f"base {self.base} can't move to its left: leave out left_limit_mps")
+        if not turns_alone and self.left_limit_mps is None:
+            raise ValueError(f"base {self.base} needs left_limit_mps")
+        return self
+
+    def vehicle(self) -> TwistBase:
+        """The base, in the process's precision."""
+        return TwistBase.create(
+            self.forward_limit_mps,
+            self.turn_limit_radps,
+            self.time_constant_s,
+            self.left_limit_mps or 0.0,
+            _sigmas(self.sigma, TWIST_ERRORS, DEFAULT_TWIST_SIGMA),
+            None if self.gyro is None else self.gyro.gyro(),
+        )
+
+
 class StartEntry(Entry):
     """The pose at which a drive starts."""
 
     x_m: Position
     y_m: Position
     psi_deg: AngleDeg
-
-
-class RouteFile(Entry):
-    """A route file."""
-
-    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
-    waypoint_radius_m: Radius
-    leave_m: Radius | None = None
-    start: StartEntry
 
 
 @dataclass(frozen=True)
@@ -152,6 +230,46 @@ class Route:
         )
 
 
+class _RouteEntry(Entry):
+    """What all forms of a route have in common."""
+
+    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
+    waypoint_radius_m: Radius
+    leave_m: Radius | None = None
+
+    def _from(self, start_pose: tuple[float, float, float]) -> Route:
+        waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
+        return Route(waypoints_m, self.waypoint_radius_m, start_pose, self.leave_m)
+
+
+class RouteFile(_RouteEntry):
+    """A route file."""
+
+    start: StartEntry
+
+    def route(self) -> Route:
+        """The `Route` of this file."""
+        return self._from((self.start.x_m, self.start.y_m, math.radians(self.start.psi_deg)))
+
+
+class RecordedRoute(_RouteEntry):
+    """A route in the header of a recorded drive, with the numbers of `Route` itself."""
+
+    start_pose: Place
+
+    @field_validator("start_pose")
+    @classmethod
+    def _turned_little(cls, start_pose: list[float]) -> list[float]:
+        if problem := problem_of("angle_rad", start_pose[2]):
+            raise ValueError(f"psi {problem}")
+        return start_pose
+
+    def route(self) -> Route:
+        """The `Route` of this entry."""
+        x_m, y_m, psi_rad = self.start_pose
+        return self._from((x_m, y_m, psi_rad))
+
+
 def load_vehicle(path: str | Path) -> Vehicle | TwistBase:
     """Read a vehicle's parameters and limits: of a car, or of another base.
 
@@ -172,7 +290,7 @@ def may_resume(path: Path) -> bool:
 
 def is_base_file(data: Mapping[str, Any]) -> bool:
     """Whether this is a vehicle file of a base that is no car."""
-    return bool(data.get("base", ACKERMANN) != ACKERMANN)
+    return bool(data.get("base", "ackermann") != "ackermann")
 
 
 def _read(path: Path) -> VehicleFile | BaseFile:
@@ -211,18 +329,38 @@ def as_car(vehicle: Vehicle | TwistBase, where: str | Path, key: str = "base") -
     return vehicle
 
 
-def vehicle_data(vehicle: Vehicle | TwistBase) -> dict[str, Any]:
-    """The content of a vehicle's file, all numbers bit for bit; see `VehicleFile`."""
+def vehicle_data(
+    vehicle: Vehicle | TwistBase, sigma: Mapping[str, float] | None = None
+) -> dict[str, Any]:
+    """The content of a vehicle's file, all numbers bit for bit; see `VehicleFile`.
+
+    Args:
+        sigma: standard deviations, by the names of their keys, in place of the vehicle's own.
+    """
+    known = np.zeros(4) if vehicle.sensor_sigma is None else vehicle.sensor_sigma
+    written: dict[str, Any]
     if isinstance(vehicle, TwistBase):
-        return base_data(vehicle)
-    data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
-    # Without corrections that correct nothing, any version of the program reads the file.
-    written: dict[str, Any] = {n: value for n, value in data.items() if _FIGURES[n] != value}
-    sigma = np.zeros(4) if vehicle.sensor_sigma is None else np.asarray(vehicle.sensor_sigma, float)
-    dtype = np.asarray(vehicle.wheelbase_m).dtype
-    if not np.array_equal(sigma, DEFAULT_SENSOR_SIGMA.astype(dtype)):
-        written["sigma"] = dict(zip(SENSOR_ERRORS, sigma.tolist(), strict=True))
-    return written | gyro_data(vehicle.gyro)
+        moves_sideways = float(vehicle.left_limit_mps) != 0
+        names = ["forward_limit_mps", "turn_limit_radps", "time_constant_s"]
+        names += ["left_limit_mps"] * moves_sideways
+        written = {"base": "omni" if moves_sideways else "differential"}
+        written |= {name: float(getattr(vehicle, name)) for name in names}
+        said = zip(TWIST_ERRORS, np.asarray(known, float).tolist(), strict=True)
+    else:
+        data = {name: float(getattr(vehicle, name)) for name in _FIGURES}
+        # Without what corrects nothing, any version of the program reads the file.
+        written = {name: value for name, value in data.items() if _FIGURES[name] != value}
+        said = zip(SENSOR_ERRORS, np.asarray(known, float).tolist(), strict=True)
+        dtype = np.asarray(vehicle.wheelbase_m).dtype
+        if np.array_equal(known, DEFAULT_SENSOR_SIGMA.astype(dtype)):
+            said = zip((), (), strict=True)
+    found = {name: float(value) for name, value in (sigma or {}).items()}
+    if sigmas := dict(said) | found:
+        written["sigma"] = sigmas
+    if (gyro := vehicle.gyro) is not None:
+        of_gyro = dataclasses.fields(gyro)
+        written["gyro"] = {field.name: float(getattr(gyro, field.name)) for field in of_gyro}
+    return written
 
 
 def save_vehicle(
@@ -240,20 +378,7 @@ def save_vehicle(
     Raises:
         BadInput: the file can't be written.
     """
-    atomic_write(path, vehicle_file_text(vehicle, calibrated, sigma))
-
-
-def vehicle_file_text(
-    vehicle: Vehicle | TwistBase,
-    calibrated: Calibrated | None = None,
-    sigma: Mapping[str, float] | None = None,
-) -> str:
-    """What `save_vehicle` writes."""
-    data = vehicle_data(vehicle)
-    if sigma:
-        found = {name: float(value) for name, value in sigma.items()}
-        data["sigma"] = data.get("sigma", {}) | found
-    return yaml_text(with_provenance(data, calibrated))
+    atomic_write(path, file_text(vehicle_data(vehicle, sigma), calibrated))
 
 
 def load_route(path: str | Path) -> Route:
@@ -262,10 +387,4 @@ def load_route(path: str | Path) -> Route:
     Raises:
         BadInput: one line naming file and key.
     """
-    entry = read(path, RouteFile)
-    return Route(
-        waypoints_m=tuple((x, y) for x, y in entry.waypoints_m),
-        waypoint_radius_m=entry.waypoint_radius_m,
-        start_pose=(entry.start.x_m, entry.start.y_m, math.radians(entry.start.psi_deg)),
-        leave_m=entry.leave_m,
-    )
+    return read(path, RouteFile).route()

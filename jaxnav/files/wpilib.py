@@ -23,6 +23,7 @@ from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.markers import MarkerEntry
 from jaxnav.files.ranges import within
+from jaxnav.files.reading import first_repeated
 from jaxnav.files.rigs import pose_entry
 from jaxnav.files.validation import (
     Count,
@@ -80,9 +81,8 @@ class FieldLayout(ForeignEntry):
     @field_validator("tags")
     @classmethod
     def _each_once(cls, tags: list[_FieldTag]) -> list[_FieldTag]:
-        ids = [tag.ID for tag in tags]
-        if len(set(ids)) < len(ids):
-            raise ValueError(f"tag {next(i for i in ids if ids.count(i) > 1)} is there twice")
+        if (twice := first_repeated(tag.ID for tag in tags)) is not None:
+            raise ValueError(f"tag {twice} is there twice")
         return tags
 
 

@@ -16,7 +16,9 @@ import yaml
 from jaxtyping import Float
 
 from jaxnav.errors import BadInput
+from jaxnav.files.reading import naming
 
+_WRITTEN = "can't be written"
 _LEFT_S = 3600.0  # a temporary file of this age was left behind by a process that was killed
 
 
@@ -33,7 +35,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         BadInput: the folder is missing or closed to writing, or `path` is a folder, a device or
             write-protected.
     """
-    with _naming_written(path):
+    with naming(path, _WRITTEN):
         target, older = _target(path)
         # While it is written, the file must not be open to more readers than the older one.
         beside = temporary_file(target, 0o600 if older else 0o666)
@@ -78,7 +80,7 @@ def require_writable(path: str | Path) -> None:
     Raises:
         BadInput: the file can't be written.
     """
-    with _naming_written(path):
+    with naming(path, _WRITTEN):
         temporary_file(_target(path)[0], 0o600).unlink()
 
 
@@ -94,7 +96,7 @@ def sole_writer(path: str | Path) -> Iterator[None]:
     """
     path = Path(os.path.realpath(path))
     beside = path.with_name(f".{path.name}.lock")
-    with _naming_written(path):
+    with naming(path, _WRITTEN):
         fd = _locked(beside)
     if fd is None:
         raise BadInput(path, "is being written by another process")
@@ -125,16 +127,6 @@ def _locked(path: Path) -> int | None:
                 return fd
         # Between opening and locking, the process that had it has removed it.
         os.close(fd)
-
-
-@contextmanager
-def _naming_written(path: str | Path) -> Iterator[None]:
-    """Turn the system's errors about a file that is written into `BadInput`."""
-    try:
-        yield
-    except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(path, f"can't be written: {reason}") from None
 
 
 def atomic_write(path: str | Path, content: str | bytes) -> None:
@@ -194,12 +186,11 @@ def output_folder(path: str | Path) -> Path:
         BadInput: a file is in the way, or the folder can't be made or written to.
     """
     path = Path(path)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise BadInput(path, "is a file, not a folder") from None
-    except OSError as error:
-        raise BadInput(path, f"can't be made: {(error.strerror or str(error)).lower()}") from None
+    with naming(path, "can't be made"):
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError):
+            raise BadInput(path, "is a file, not a folder") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise BadInput(path, "can't be written to: permission denied")
     return path

@@ -13,9 +13,9 @@ import numpy as np
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import SENSOR_ERRORS, Vehicle
 from jaxnav.files import poses
-from jaxnav.files.provenance import Calibrated
-from jaxnav.files.rigs import rig_file_text
-from jaxnav.files.vehicles import vehicle_file_text
+from jaxnav.files.provenance import Calibrated, file_text
+from jaxnav.files.rigs import rig_data
+from jaxnav.files.vehicles import vehicle_data
 from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.learnt import Learnt
 
@@ -43,11 +43,11 @@ def adopted_files(
     """
     texts = {}
     if setup.rig.extrinsics_sigma is not None:
-        texts["rig.yaml"] = rig_file_text(adopted_rig(rig or setup.rig, learnt), calibrated)
+        texts["rig.yaml"] = file_text(rig_data(adopted_rig(rig or setup.rig, learnt)), calibrated)
     if setup.vehicle.sensor_sigma is not None:
         sigma = dict(zip(SENSOR_ERRORS, learnt.sensors_sigma.tolist(), strict=True))
         adopted = adopted_vehicle(vehicle or setup.car(Path("DriveSetup")), learnt)
-        texts["vehicle.yaml"] = vehicle_file_text(adopted, calibrated, sigma)
+        texts["vehicle.yaml"] = file_text(vehicle_data(adopted, sigma), calibrated)
     return texts
 
 

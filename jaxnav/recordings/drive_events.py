@@ -60,10 +60,7 @@ class DriveEvents:
 
     @staticmethod
     def from_inputs(
-        inputs: Sequence[Input],
-        setup: DriveSetup,
-        where: Path,
-        refused_ns: Collection[int] = (),
+        inputs: Sequence[Input], setup: DriveSetup, where: Path, refused_ns: Collection[int] = ()
     ) -> "DriveEvents":
         """The events of a pilot's inputs.
 

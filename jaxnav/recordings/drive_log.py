@@ -69,17 +69,16 @@ class DriveLog:
     missing: dict[str, int]
     truncated: bool
 
-    def images(self, topic: str | None = None) -> Iterator[RecordedImage]:
-        """Read the images from the file one by one, of one topic or, by default, of all.
+    def images(self) -> Iterator[RecordedImage]:
+        """Read the images from the file one by one.
 
         Raises:
             BadInput: an image is damaged.
         """
         for message in McapMessages(self.path):
             if isinstance(message, RecordedMessage) and message.schema == IMAGE_SCHEMA:
-                if topic in (None, message.topic):
-                    checked = _checked(ImageMessage, message, self.path, message.topic)
-                    yield RecordedImage(message.topic, message.stamp_ns, checked.data)
+                checked = _checked(ImageMessage, message, self.path, message.topic)
+                yield RecordedImage(message.topic, message.stamp_ns, checked.data)
 
 
 def profile_of(path: Path) -> str | None:

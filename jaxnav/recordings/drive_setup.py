@@ -34,23 +34,18 @@ from jaxnav.drive.health import Timeouts
 from jaxnav.drive.pilot import Pilot
 from jaxnav.errors import BadInput
 from jaxnav.files import Params, Route, apply_params
-from jaxnav.files.bases import BaseFile
 from jaxnav.files.executables import PACKAGE, sources_digest
 from jaxnav.files.markers import MarkerFile, marker_data
-from jaxnav.files.ranges import problem_of
 from jaxnav.files.rigs import RigFile, rig_data
-from jaxnav.files.validation import (
-    CornerSigma,
-    Entry,
-    FloorPlace,
-    Point,
-    Position,
-    Radius,
-    Text,
-    at,
-    validate,
+from jaxnav.files.validation import CornerSigma, Entry, Point, Text, at, validate
+from jaxnav.files.vehicles import (
+    BaseFile,
+    RecordedRoute,
+    VehicleFile,
+    as_car,
+    is_base_file,
+    vehicle_data,
 )
-from jaxnav.files.vehicles import VehicleFile, as_car, is_base_file, vehicle_data
 from jaxnav.recordings.records import Flag
 
 SETUP_VERSION = 1
@@ -62,28 +57,6 @@ _WITHOUT = (
 PILOT_SELECTORS = tuple(name for name in SELECTORS if name not in ("orientation-given", "oracle"))
 
 _Limit = Annotated[float, Field(strict=True, ge=0)]  # also inf: never
-
-
-class RouteEntry(Entry):
-    """A route in the header; see `Route`."""
-
-    waypoints_m: Annotated[list[FloorPlace], Field(min_length=1, max_length=4096)]
-    waypoint_radius_m: Radius
-    start_pose: Annotated[list[Position], Field(min_length=3, max_length=3)]
-    leave_m: Radius | None = None
-
-    @field_validator("start_pose")
-    @classmethod
-    def _turned_little(cls, start_pose: list[float]) -> list[float]:
-        if problem := problem_of("angle_rad", start_pose[2]):
-            raise ValueError(f"psi {problem}")
-        return start_pose
-
-    def route(self) -> Route:
-        """The `Route` of this entry."""
-        x_m, y_m, psi_rad = self.start_pose
-        waypoints_m = tuple((x, y) for x, y in self.waypoints_m)
-        return Route(waypoints_m, self.waypoint_radius_m, (x_m, y_m, psi_rad), self.leave_m)
 
 
 _timeouts: dict[str, Any] = {limit.name: (_Limit, ...) for limit in fields(Timeouts)}
@@ -98,7 +71,7 @@ class SetupEntry(Entry):
     markers: MarkerFile
     origin_m: Point | None = None  # origin of the map's coordinates; maps near zero have none
     vehicle: VehicleFile
-    route: RouteEntry
+    route: RecordedRoute
     selector: Text
     corner_sigma_px: CornerSigma | None
     parameters: dict[str, Any] = Field(default_factory=dict)  # older drives have none

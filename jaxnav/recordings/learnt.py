@@ -24,9 +24,7 @@ _WORDS = (
 )
 
 
-def errors_of(
-    bank: Bank,
-) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+def errors_of(bank: Bank) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
     """The errors that the heaviest hypothesis of a vehicle keeps, and their sigmas.
 
     (k, g, o, tau) of `sensor_errors`, then three turns a camera in units of their prior's sigma,
@@ -36,20 +34,16 @@ def errors_of(
     Args:
         bank: of NumPy, with its leading axis (K,).
     """
-    at = errors_at(bank)
-    return np.asarray(bank.mean[at], float), error_sigmas(np.asarray(bank.covariance[at[0]]))
-
-
-def errors_at(bank: Bank) -> tuple[int, slice]:
-    """Where in `bank.mean` they stand: slot of the heaviest hypothesis, and its last entries."""
-    best = int(np.argmax(np.where(bank.initialised, bank.log_weight, -np.inf)))
+    best = heaviest_slot(bank)
     count, states = bank.mean.shape[1], bank.covariance.shape[1]
-    return best, slice(count - states + LEARNT, count)
+    variances = np.diagonal(np.asarray(bank.covariance)[best])[LEARNT:]
+    errors = np.asarray(bank.mean)[best, count - states + LEARNT :]
+    return errors.astype(float), np.sqrt(np.maximum(variances, 0)).astype(float)
 
 
-def error_sigmas(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, " e"]:
-    """The sigmas of the errors in the covariance (d, d) of a hypothesis."""
-    return np.sqrt(np.maximum(np.diagonal(covariance)[LEARNT:], 0)).astype(float)
+def heaviest_slot(bank: Bank) -> int:
+    """The slot of the heaviest hypothesis of a bank of NumPy."""
+    return int(np.argmax(np.where(bank.initialised, bank.log_weight, -np.inf)))
 
 
 def as_filed(

@@ -27,7 +27,7 @@ import numpy as np
 from mcap.writer import Writer
 
 from jaxnav.drive.pilot import Input, Outcome
-from jaxnav.errors import BadInput
+from jaxnav.files.reading import naming
 from jaxnav.recordings.drive_format import HEADER, PROFILE, encode, header_metadata
 from jaxnav.recordings.records import (
     IMAGE_SCHEMA,
@@ -89,17 +89,15 @@ class Recorder:
         """
         self.path = Path(path)
         metadata = header_metadata(header)
-        try:
+        with naming(self.path, "can't be written", ValueError):  # ValueError: a NUL in the name
             self._file = _File(self.path)
-        except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-            raise BadInput(self.path, f"can't be written: {_reason(error)}") from None
-        self._writer = Writer(cast(IO[bytes], self._file), enable_data_crcs=True)
-        try:
-            self._writer.start(profile=PROFILE, library="jaxnav")
-            self._writer.add_metadata(HEADER, metadata)
-        except OSError as error:
-            self._file.leave()
-            raise BadInput(self.path, f"can't be written: {_reason(error)}") from None
+            self._writer = Writer(cast(IO[bytes], self._file), enable_data_crcs=True)
+            try:
+                self._writer.start(profile=PROFILE, library="jaxnav")
+                self._writer.add_metadata(HEADER, metadata)
+            except OSError:
+                self._file.leave()
+                raise
         self._queue_messages, self._queue_images = queue_messages, queue_images
         self._queue: deque[_Item] = deque()
         self._lock = threading.RLock()  # a signal handler may call `close` during a `put`
@@ -191,8 +189,9 @@ class Recorder:
             if self._keeps_empty:
                 self._file.take_place(only_where_free=True)
         except Exception as error:  # from the disk or anything else: the vehicle drives on
+            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             with self._lock:
-                self.failed = f"{self.path}: can't be written: {_reason(error)}"
+                self.failed = f"{self.path}: can't be written: {reason.lower()}"
                 self.dropped += len(self._queue)
                 self._queue.clear()
         with suppress(OSError):
@@ -303,7 +302,3 @@ def _image_message(topic: str, stamp_ns: int, image: bytes | np.ndarray) -> _Mes
 def _time(stamp_ns: int) -> int:
     """Clamp a time to MCAP's range."""
     return min(max(int(stamp_ns), 0), _MAX_TIME_NS)
-
-
-def _reason(error: Exception) -> str:
-    return (getattr(error, "strerror", None) or str(error) or type(error).__name__).lower()

@@ -47,20 +47,14 @@ from jaxnav.core.models.origin import inverses_in_world, planar_in_world
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections
-from jaxnav.drive.interfaces import (
-    MOST_TURNS,
-    GyroReading,
-    Odometry,
-    Reading,
-    reading_of,
-)
+from jaxnav.drive.interfaces import MOST_TURNS, GyroReading, Odometry, Reading, reading_of
 from jaxnav.drive.pilot import Input, Outcome
 from jaxnav.errors import BadInput
 from jaxnav.files import limits
 from jaxnav.files.ranges import RANGES
 from jaxnav.files.validation import Count, Entry
 from jaxnav.recordings.drive_format import NOT_FINITE
-from jaxnav.recordings.learnt import error_sigmas, errors_at, repeated_share
+from jaxnav.recordings.learnt import errors_of, repeated_share
 
 ODOMETRY, TWIST, FRAMES, TICK, OUTCOME = "/odometry", "/twist", "/frames", "/tick", "/outcome"
 IMAGE_SCHEMA = "foxglove.CompressedImage"
@@ -157,9 +151,7 @@ Flag = Annotated[bool, Field(strict=True)]
 Word = Annotated[str, Field(strict=True)]
 Faults = Annotated[Fault, _words(Fault)]
 Base64 = Annotated[
-    bytes,
-    BeforeValidator(_bytes),
-    WithJsonSchema({"type": "string", "contentEncoding": "base64"}),
+    bytes, BeforeValidator(_bytes), WithJsonSchema({"type": "string", "contentEncoding": "base64"})
 ]
 
 # --- inputs ---
@@ -208,6 +200,7 @@ class GyroMessage(Entry):
 class TickMessage(Entry):
     """An `Input` without odometry and frames."""
 
+    VALUES: ClassVar[tuple[str, ...]] = ()  # the fields of a reading, in the order of `values`
     now_ns: Now
     faults: Faults
     gyro: list[GyroMessage] = Field(default_factory=list, max_length=MOST_TURNS)
@@ -216,10 +209,11 @@ class TickMessage(Entry):
         """The input of this message."""
         frames = tuple(frame.frame() for frame in getattr(self, "frames", ()))
         gyro = tuple(GyroReading(one.stamp_ns, one.turn_radps) for one in self.gyro)
-        return Input(self.now_ns, self._reading(), frames, self.faults, gyro)
-
-    def _reading(self) -> Reading | None:
-        return None
+        reading, fields = None, vars(self)
+        if self.VALUES:
+            values = [fields[name] for name in self.VALUES]
+            reading = reading_of(fields["stamp_ns"], values, fields["valid"])
+        return Input(self.now_ns, reading, frames, self.faults, gyro)
 
 
 class FramesMessage(TickMessage):
@@ -231,14 +225,9 @@ class FramesMessage(TickMessage):
 class ReadingMessage(TickMessage):
     """What the two kinds of odometry share: its stamp, and the frames that showed nothing."""
 
-    VALUES: ClassVar[tuple[str, ...]]  # the fields that were read, in the order of `values`
     stamp_ns: Stamp
     valid: Flag
     frames: list[FrameMessage] = Field(default_factory=list)
-
-    def _reading(self) -> Reading:
-        values = [getattr(self, name) for name in self.VALUES]
-        return reading_of(self.stamp_ns, values, self.valid)
 
 
 class OdometryMessage(ReadingMessage):
@@ -384,13 +373,11 @@ def _named(kind: Any, name: str) -> Column:
 
 
 def _errors(one: Outcome) -> np.ndarray:
-    bank = one.belief.bank
-    return np.asarray(bank.mean[errors_at(bank)])
+    return errors_of(one.belief.bank)[0]
 
 
 def _sigma(one: Outcome) -> np.ndarray:
-    bank = one.belief.bank
-    return error_sigmas(np.asarray(bank.covariance[errors_at(bank)[0]]))
+    return errors_of(one.belief.bank)[1]
 
 
 def _hypotheses(one: Outcome) -> np.ndarray:
@@ -542,19 +529,17 @@ _FIELDS: dict[str, Any] = {
 }
 
 
-def outcome_message(outcome: Outcome, state: str | None = None) -> dict[str, Any]:
+def outcome_message(outcome: Outcome) -> dict[str, Any]:
     """The message of an outcome.
 
     Args:
         outcome: with NumPy leaves in its output.
-        state: in place of its `digest`.
     """
     message = {}
     for name, column in COLUMNS.items():
         if (value := column.of(outcome)) is not None:
             message[name] = value.ravel() if isinstance(value, np.ndarray) and value.ndim else value
-    message["digest"] = digest(outcome) if state is None else state
-    return message
+    return message | {"digest": digest(outcome)}
 
 
 def digest(outcome: Outcome) -> str:
@@ -594,10 +579,7 @@ MESSAGES: dict[str, tuple[str, type[TickMessage | OutcomeMessage]]] = {
     TWIST: ("jaxnav.Twist", TwistMessage),
     FRAMES: ("jaxnav.Frames", FramesMessage),
     TICK: ("jaxnav.Tick", TickMessage),
-    OUTCOME: (
-        "jaxnav.Outcome",
-        create_model("OutcomeMessage", __base__=OutcomeMessage, **_FIELDS),
-    ),
+    OUTCOME: ("jaxnav.Outcome", create_model("OutcomeMessage", __base__=OutcomeMessage, **_FIELDS)),
 }
 _KEPT = (
     *("type", "enum", "contentEncoding", "minimum", "exclusiveMaximum", "items", "minItems"),

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -132,11 +131,3 @@ def test_the_path_of_a_cache_is_judged_as_the_commands_is(tmp_path) -> None:
         (flags, _, float64, found), said = shown(script, tmp_path, XLA_FLAGS=given)
         assert (flags, float64, found) == (given, False, kept)
         assert ("can be written to by all" in said) == (kept is None)
-
-
-def test_lineax_is_for_those_who_develop(tmp_path) -> None:
-    """Nothing of the package imports it; optimistix brings it."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert not any(line.startswith("lineax") for line in project["dependencies"])
-    sources = (path.read_text(encoding="utf-8") for path in (ROOT / "jaxnav").rglob("*.py"))
-    assert not any("import lineax" in source for source in sources)

@@ -2,46 +2,28 @@
 
 import json
 import os
-import struct
-import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import jax
 import numpy as np
 import pytest
 import yaml
 
 from jaxnav import files
+from jaxnav.core.models.imu import GYROS
 from jaxnav.core.models.rig import PLACED_BY_HAND
-from jaxnav.errors import BadInput
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase
 from jaxnav.files import poses
-from jaxnav.files.images import decode_image
 from jaxnav.files.rigs import CameraSigma
 from tests.helpers import seed_texts
+from tests.helpers.bad_input import problem
 
 QCAR = files.calib_dir() / "qcar"
-LOADERS: dict[str, Callable[[Path], Any]] = {
-    "rig.yaml": files.load_rig,
-    "markers.yaml": files.load_markers,
-    "vehicle.yaml": files.load_vehicle,
-    "route.yaml": files.load_route,
-}
-
-
-def problem(call: Callable[..., Any], *args: Any) -> str:
-    """The one line that a person gets."""
-    with pytest.raises(BadInput) as caught:
-        call(*args)
-    line = str(caught.value)
-    assert "\n" not in line
-    return line
 
 
 def leaves_equal(a: Any, b: Any) -> bool:
-    leaves_a, leaves_b = jax.tree.leaves(a), jax.tree.leaves(b)
+    leaves_a, leaves_b = (list(map(np.asarray, jax.tree.leaves(tree))) for tree in (a, b))
     return jax.tree.structure(a) == jax.tree.structure(b) and all(
         x.dtype == y.dtype and np.array_equal(x, y) for x, y in zip(leaves_a, leaves_b, strict=True)
     )
@@ -79,19 +61,15 @@ def test_the_paper_s_marker_faces_the_start():
     np.testing.assert_allclose(R_world_marker[:, 2], [0, -1, 0], atol=1e-12)
 
 
-def test_the_route_starts_towards_its_first_waypoint():
+def test_the_car_starts_towards_its_first_waypoint():
+    vehicle = files.load_vehicle(QCAR / "vehicle.yaml")
+    figures = vehicle.wheelbase_m, vehicle.steering_limit_rad, vehicle.throttle_limit
+    assert [float(figure) for figure in figures] == [0.256, 0.5, 0.3]
     route = files.load_route(QCAR / "route.yaml")
     assert route.waypoints_m == ((1.30, 0.0), (0.50, 0.65))
     x, y, psi_rad = route.start_pose
     assert (x, y) == (2.0, -1.0)
     assert np.arctan2(0.0 - y, 1.30 - x) == pytest.approx(psi_rad, abs=1e-3)
-
-
-def test_the_vehicle_holds_the_paper_s_figures():
-    vehicle = files.load_vehicle(QCAR / "vehicle.yaml")
-    assert float(vehicle.wheelbase_m) == 0.256
-    assert float(vehicle.steering_limit_rad) == 0.5
-    assert float(vehicle.throttle_limit) == 0.3
 
 
 def test_data_is_found_in_a_wheel_and_in_a_checkout(tmp_path, monkeypatch):
@@ -108,62 +86,46 @@ def test_data_is_found_in_a_wheel_and_in_a_checkout(tmp_path, monkeypatch):
 
 
 def test_a_saved_rig_reads_back_bit_for_bit(precision, tmp_path):
+    """With sigmas of places that are stated, left out, and exact."""
     text = yaml.safe_load((QCAR / "rig.yaml").read_text())
+    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 15.0]}
     odd = {"position_m": [0.1, 0.2, 0.3], "yaw_deg": 33.3, "elevation_deg": -7.1, "roll_deg": 1.7}
+    text["cameras"][0] |= {"sigma": stated}
     text["cameras"][1] |= odd | {"lens": "radtan", "distortion": [0.1, -0.02, 1e-3, 2e-4]}
-    text["cameras"][2] |= {"lens": "none", "distortion": []}
-    text["cameras"][3] |= {"exposure_s": 0.0123, "row_time_s": 0}
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(text))
-    rig = files.load_rig(tmp_path / "rig.yaml")
-    assert rig.cameras.focal_px.dtype == precision
+    text["cameras"][2] |= {"lens": "none", "distortion": []} | sigma_of([0] * 3, [0] * 3)
+    text["cameras"][3] |= {"exposure_s": 0.0123, "row_time_s": 0, "sigma": {"focal_px": [0.1] * 2}}
+    rig = files.load_rig(write(tmp_path, text))
+    assert rig.cameras.focal_px.dtype == rig.extrinsics_sigma.dtype == precision
     files.save_rig(tmp_path / "again.yaml", rig)
     again = files.load_rig(tmp_path / "again.yaml")
     assert leaves_equal(rig, again)
     assert (again.names, again.image_sizes_px) == (rig.names, rig.image_sizes_px)
     assert rig.timing(3) == again.timing(3) == (0.0123, 0.0)
     assert rig.timing(0) == again.timing(0) == rig.first(1).timing(0) == (None, None)
-
-
-def test_sigmas_of_places_read_back_bit_for_bit(precision, tmp_path):
-    """Stated, left out, and exact: read, written and read again."""
-    text = yaml.safe_load((QCAR / "rig.yaml").read_text())
-    stated = {"position_m": [0.001, 0.0023, 0.5], "rotation_deg": [0.1, 0.37, 15.0]}
-    text["cameras"][0]["sigma"] = stated
-    text["cameras"][2]["sigma"] = {"position_m": [0] * 3, "rotation_deg": [0] * 3}
-    text["cameras"][3]["sigma"] = {"focal_px": [0.1, 0.1]}  # says nothing of the place
-    rig = files.load_rig(write(tmp_path, text))
-    assert rig.extrinsics_sigma is not None
-    assert rig.extrinsics_sigma.dtype == precision
-    sigma = np.asarray(rig.extrinsics_sigma)
+    sigma = np.asarray(again.extrinsics_sigma)
     np.testing.assert_allclose(sigma[0, :3], stated["position_m"], rtol=1e-7)
     np.testing.assert_allclose(np.rad2deg(sigma[0, 3:]), stated["rotation_deg"], rtol=1e-6)
     np.testing.assert_array_equal(sigma[2], 0)
-    for index in (1, 3):
-        np.testing.assert_allclose(sigma[index], PLACED_BY_HAND, rtol=1e-7)
-    files.save_rig(tmp_path / "again.yaml", rig)
-    again = files.load_rig(tmp_path / "again.yaml")
-    assert again.extrinsics_sigma is not None
-    np.testing.assert_array_equal(again.extrinsics_sigma, sigma)
-    assert leaves_equal(rig, again)
+    np.testing.assert_allclose(sigma[[1, 3]], [PLACED_BY_HAND] * 2, rtol=1e-7)
 
 
-def test_where_nobody_says_the_format_tells_how_well_cameras_are_placed(tmp_path):
-    by_hand, calibrated = (
-        files.load_rig(path).extrinsics_sigma
-        for path in (QCAR / "rig.yaml", write(tmp_path, KALIBR))
-    )
-    np.testing.assert_allclose(by_hand, [[0.005] * 3 + [np.deg2rad(0.5)] * 3] * 4, rtol=1e-7)
-    np.testing.assert_allclose(calibrated, [[0.002] * 3 + [np.deg2rad(0.2)] * 3] * 2, rtol=1e-7)
-
-
-def test_cameras_whose_sigmas_are_all_0_are_exact(tmp_path):
+def test_cameras_are_placed_as_well_as_the_format_tells_or_are_exact(tmp_path):
     text = yaml.safe_load((QCAR / "rig.yaml").read_text())
     for camera in text["cameras"]:
         camera["sigma"] = {"position_m": [0] * 3, "rotation_deg": [0.0] * 3}
-    rig = files.load_rig(write(tmp_path, text))
-    assert rig.extrinsics_sigma is None
-    files.save_rig(tmp_path / "again.yaml", rig)
-    assert files.load_rig(tmp_path / "again.yaml").extrinsics_sigma is None
+    exact = files.load_rig(write(tmp_path, text, "exact.yaml"))
+    files.save_rig(tmp_path / "again.yaml", exact)
+    for path, expected in (
+        (QCAR / "rig.yaml", [[0.005] * 3 + [np.deg2rad(0.5)] * 3] * 4),
+        (write(tmp_path, KALIBR), [[0.002] * 3 + [np.deg2rad(0.2)] * 3] * 2),
+        (tmp_path / "exact.yaml", None),
+        (tmp_path / "again.yaml", None),
+    ):
+        sigma = files.load_rig(path).extrinsics_sigma
+        if expected is None:
+            assert sigma is None
+        else:
+            np.testing.assert_allclose(sigma, expected, rtol=1e-7)
 
 
 def test_a_calibration_s_sigmas_are_those_of_the_rig_it_saves(tmp_path):
@@ -246,6 +208,9 @@ def one_camera(name: str) -> dict[str, Any]:
     }
 
 
+ONE_CAMERA = one_camera("front") | {"position_m": [0, 0, 0], "yaw_deg": 0}
+
+
 class _NoAliases(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -269,20 +234,14 @@ BAD_CAMERAS = [
     ({"focal_px": 319}, "cameras.front.focal_px: must be a list, got 319"),
     ({"focal_px": ["319", 319]}, "cameras.front.focal_px[0]: must be a number, got the text '319'"),
     ({"center_px": [1e300, 1]}, "cameras.front.center_px[0]: must be <= 1e+09, got 1e+300"),
-    (
-        {"lens": "fisheye"},
-        "cameras.front.lens: must be 'none', 'radtan', 'rational', 'thin_prism', ",
-    ),
+    ({"lens": "fisheye"},
+     "cameras.front.lens: must be 'none', 'radtan', 'rational', 'thin_prism', "),
     ({"distortion": [1, 2, 3]}, "cameras.front.distortion: must have 4 coefficients"),
     ({"lens": "radtan", "distortion": [1] * 3}, "front.distortion: must have 4 or 5 coefficients"),
-    (
-        {"lens": "double_sphere", "distortion": [0.1, 1.2]},
-        "front.distortion: alpha of the lens double_sphere must be from 0 to 1, got 1.2",
-    ),
-    (
-        {"lens": "omni", "distortion": [-0.1, 0, 0, 0, 0]},
-        "front.distortion: xi of the lens omni must be at least 0, got -0.1",
-    ),
+    ({"lens": "double_sphere", "distortion": [0.1, 1.2]},
+     "front.distortion: alpha of the lens double_sphere must be from 0 to 1, got 1.2"),
+    ({"lens": "omni", "distortion": [-0.1, 0, 0, 0, 0]},
+     "front.distortion: xi of the lens omni must be at least 0, got -0.1"),
     ({"image_size_px": [820.5, 410]}, "front.image_size_px[0]: must be a whole number, got 820.5"),
     ({"image_size_px": [820, 0]}, "cameras.front.image_size_px[1]: must be >= 1, got 0"),
     ({"focal": 3}, "cameras.front.focal: unknown key"),
@@ -291,35 +250,24 @@ BAD_CAMERAS = [
     ({"T_camera_vehicle": np.eye(4).tolist()}, "got T_camera_vehicle and position_m"),
     ({"yaw_deg": None}, "cameras.front: position_m needs yaw_deg"),
     ({"position_m": None, "T_vehicle_camera": MIRROR}, "T_vehicle_camera: the 3x3 part has det(R)"),
-    (
-        {"position_m": None, "T_vehicle_camera": np.diag([1, 1, 1.01, 1]).tolist()},
-        "cameras.front.T_vehicle_camera: the 3x3 part is not a rotation",
-    ),
-    (
-        {"position_m": None, "T_vehicle_camera": np.ones((4, 4)).tolist()},
-        "cameras.front.T_vehicle_camera: the last row must be 0 0 0 1",
-    ),
-    (
-        {"position_m": None, "T_vehicle_camera": np.eye(3).tolist()},
-        "cameras.front.T_vehicle_camera[0]: must have at least 4 entries, got 3",
-    ),
-    (
-        {"position_m": None, "T_vehicle_camera": {"wxyz": [1, 1, 0, 0], "xyz_m": [0, 0, 0]}},
-        "cameras.front.T_vehicle_camera.wxyz: must have length 1, got 1.41421",
-    ),
+    ({"position_m": None, "T_vehicle_camera": np.diag([1, 1, 1.01, 1]).tolist()},
+     "cameras.front.T_vehicle_camera: the 3x3 part is not a rotation"),
+    ({"position_m": None, "T_vehicle_camera": np.ones((4, 4)).tolist()},
+     "cameras.front.T_vehicle_camera: the last row must be 0 0 0 1"),
+    ({"position_m": None, "T_vehicle_camera": np.eye(3).tolist()},
+     "cameras.front.T_vehicle_camera[0]: must have at least 4 entries, got 3"),
+    ({"position_m": None, "T_vehicle_camera": {"wxyz": [1, 1, 0, 0], "xyz_m": [0, 0, 0]}},
+     "cameras.front.T_vehicle_camera.wxyz: must have length 1, got 1.41421"),
     (sigma_of([-0.01, 0, 0], [0] * 3), "front.sigma.position_m[0]: must be >= 0, got -0.01"),
     (sigma_of([0, 0.51, 0], [0] * 3), "front.sigma.position_m[1]: must be <= 0.5, got 0.51"),
     ({"sigma": {"position_m": [0.01] * 3}}, "front.sigma: rotation_deg is missing: it goes with"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("change", "expected"), BAD_CAMERAS, ids=lambda v: str(v)[:40])
 def test_a_bad_camera_is_named_with_its_key(tmp_path, change, expected):
-    camera = one_camera("front") | {"position_m": [0, 0, 0], "yaw_deg": 0} | change
-    path = write(
-        tmp_path,
-        {"cameras": [{k: v for k, v in camera.items() if v is not None or k == "focal_px"}]},
-    )
+    camera = ONE_CAMERA | change
+    path = write(tmp_path, {"cameras": [{k: v for k, v in camera.items() if v is not None}]})
     line = problem(files.load_rig, path)
     assert line.startswith(f"{path}: ")
     assert expected in line
@@ -339,6 +287,10 @@ def test_a_bad_camera_is_named_with_its_key(tmp_path, change, expected):
         ("a: [1, 2", "is not valid YAML: line 1"),
         ("a: \x01", "is not valid YAML"),
         ("1: 2", "the key 1 must be a word"),
+        (
+            "cameras: [{a}, {a}]".replace("{a}", json.dumps(ONE_CAMERA)),
+            "cameras: the name 'front' is used twice",
+        ),
         ("camera: 3", "is neither a rig (`cameras:`) nor a Kalibr camchain (`cam0:`)"),
     ],
 )
@@ -357,12 +309,6 @@ def test_what_is_no_text_file_is_one_line(tmp_path):
     (tmp_path / "big.yaml").write_bytes(b"#" * (3 * 2**20))
     assert "is larger than 2 MiB" in problem(files.load_rig, tmp_path / "big.yaml")
     assert "can't be read" in problem(files.load_rig, Path("a\0b"))
-
-
-def test_camera_names_differ(tmp_path):
-    camera = one_camera("front") | {"position_m": [0, 0, 0], "yaw_deg": 0}
-    line = problem(files.load_rig, write(tmp_path, {"cameras": [camera, camera]}))
-    assert line.endswith("cameras: the name 'front' is used twice")
 
 
 def test_numbers_are_those_of_yaml_1_2(tmp_path):
@@ -406,24 +352,76 @@ def test_a_marker_stands_once_in_a_map(tmp_path):
     assert "marker 0 of tag36h11 is in the map twice" in line
 
 
-@pytest.mark.parametrize(
-    ("loader", "old", "new", "expected"),
-    [
-        ("vehicle.yaml", "wheelbase_m: 0.256", "wheelbase_m: 0", "wheelbase_m: must be > 0, got 0"),
-        ("vehicle.yaml", "wheelbase_m: 0.256", "", "wheelbase_m: missing"),
-        ("vehicle.yaml", "wheelbase_m:", "wheelbase:", "(and 1 more)"),
-        ("vehicle.yaml", "steering_limit_rad: 0.5", "steering_limit_rad: 30", "must be < 1.5708"),
-        ("route.yaml", "[[1.30, 0.0], [0.50, 0.65]]", "[]", "waypoints_m: must have at least 1"),
-        ("route.yaml", "psi_deg: 125.0", "psi: 2", "start.psi_deg: missing"),
-    ],
-)
-def test_a_bad_vehicle_or_route_is_named_with_its_key(tmp_path, loader, old, new, expected):
-    text = (QCAR / loader).read_text()
-    assert old in text
-    path = write(tmp_path, text.replace(old, new), loader)
-    line = problem(LOADERS[loader], path)
-    assert line.startswith(f"{path}: ")
-    assert expected in line
+# --- bases that are no cars, and gyros ---
+
+DIFFERENTIAL = {
+    "base": "differential",
+    "forward_limit_mps": 1.2,
+    "turn_limit_radps": 3.0,
+    "time_constant_s": 0.15,
+}
+OMNI = DIFFERENTIAL | {"base": "mecanum", "left_limit_mps": 0.7}
+CAR = yaml.safe_load((QCAR / "vehicle.yaml").read_text())
+
+
+def vehicle_file(folder: Path, data: dict[str, Any]) -> Path:
+    return write(folder, data, "vehicle.yaml")
+
+
+def test_a_base_as_its_file_says(tmp_path):
+    base = files.load_vehicle(vehicle_file(tmp_path, DIFFERENTIAL | {"sigma": {"turn_gain": 0.1}}))
+    assert isinstance(base, TwistBase)
+    np.testing.assert_allclose(base.limits, [1.2, 0.0, 3.0])
+    np.testing.assert_allclose(
+        base.sensor_sigma, [DEFAULT_TWIST_SIGMA[0], 0.1, *DEFAULT_TWIST_SIGMA[2:]]
+    )
+    assert base.gyro is None
+    exact = dict.fromkeys(("speed_scale", "turn_gain", "turn_offset_radpm", "camera_delay_s"), 0.0)
+    assert files.load_vehicle(vehicle_file(tmp_path, OMNI | {"sigma": exact})).sensor_sigma is None
+
+
+@pytest.mark.parametrize("data", [DIFFERENTIAL, OMNI, CAR], ids=["differential", "omni", "car"])
+@pytest.mark.parametrize("gyro", [None, {"class": "tactical", "delay_s": 0.004}])
+def test_a_saved_vehicle_reads_back_bit_for_bit(data, gyro, tmp_path):
+    given = data if gyro is None else data | {"gyro": gyro}
+    vehicle = files.load_vehicle(vehicle_file(tmp_path, given))
+    files.save_vehicle(tmp_path / "saved.yaml", vehicle)
+    again = files.load_vehicle(tmp_path / "saved.yaml")
+    assert leaves_equal(again, vehicle)
+    if gyro is not None:
+        assert vehicle.gyro.delay_s == 0.004
+        assert vehicle.gyro.noise_density == GYROS["tactical"].noise_density
+
+
+def test_a_bad_base_is_named_with_its_key(tmp_path):
+    for changes, told in [
+        ({"base": "hovercraft"}, "base: must be"),
+        ({"turn_limit_radps": -1.0}, "turn_limit_radps: must be > 0"),
+        ({"forward_limit_mps": 1e5}, "forward_limit_mps: must be from"),
+        ({"left_limit_mps": 0.5}, "base differential can't move to its left"),
+        ({"base": "omni"}, "base omni needs left_limit_mps"),
+        ({"wheelbase_m": 0.3}, "wheelbase_m: unknown key"),
+        ({"sigma": {"steering_gain": 0.1}}, "sigma: unknown steering_gain"),
+        ({"sigma": {"turn_offset_radpm": 0.9}}, "sigma: turn_offset_radpm must be at most 0.35"),
+        ({"gyro": {"class": "best"}}, "gyro.class: must be"),
+        ({"gyro": {"noise_density": 0.0}}, "gyro.noise_density: must be"),
+        ({"gyro": {"delay_s": 3.0}}, "gyro.delay_s: must be"),
+        ({"gyro": {"bias": 3.0}}, "gyro.bias: unknown key"),
+    ]:
+        path = vehicle_file(tmp_path, DIFFERENTIAL | changes)
+        assert problem(files.load_vehicle, path).startswith(f"{path}: {told}")
+
+
+def test_where_only_cars_drive_other_vehicles_are_refused(tmp_path):
+    for data, told in (
+        (DIFFERENTIAL, "base: must be ackermann here"),
+        (CAR | {"gyro": {"class": "consumer"}}, "gyro: must be left out here"),
+    ):
+        path = vehicle_file(tmp_path, data)
+        assert problem(files.load_car, path).startswith(f"{path}: {told}")
+    assert (
+        float(files.load_car(vehicle_file(tmp_path, CAR | {"base": "ackermann"})).wheelbase_m) > 0
+    )
 
 
 # --- files of other tools ------------------------------------------------------------
@@ -465,52 +463,21 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
 
 
-def test_a_camchain_may_have_k3(tmp_path):
+def test_a_camchain_may_have_k3_and_lenses_beside_the_pinhole(tmp_path):
     """As TagSLAM's files do, under ROS's name of the lens."""
-    coefficients = [0.1, -0.02, 0.001, 0.002, 0.003]
-    for model in ("radtan", "plumb_bob"):
-        data = yaml.safe_load(KALIBR)
-        data["cam1"] |= {"distortion_model": model, "distortion_coeffs": coefficients}
-        camera = files.load_rig(write(tmp_path, data)).cameras
-        assert camera.lenses[int(camera.lens_index[1])] == "radtan"
-        np.testing.assert_array_equal(camera.distortion[1], [*coefficients, *[0] * 7])
-
-
-def test_a_camchain_may_have_lenses_beside_the_pinhole(tmp_path):
-    path = write(tmp_path, seed_texts.SPHERES)
-    for name, lens, focal_px, coefficients in (
-        ("cam0", "omni", 1200, [1.5, -0.1, 0.02, 0.001, 0.002]),
-        ("cam1", "double_sphere", 380, [-0.2, 0.6]),
-        ("cam2", "eucm", 470, [0.6, 1.1]),
+    k3 = yaml.safe_load(KALIBR)
+    bend = [0.1, -0.02, 0.001, 0.002, 0.003]
+    k3["cam1"] |= {"distortion_model": "plumb_bob", "distortion_coeffs": bend}
+    for data, name, lens, focal_px, coefficients in (
+        (k3, "cam1", "radtan", 400, bend),
+        (seed_texts.SPHERES, "cam0", "omni", 1200, [1.5, -0.1, 0.02, 0.001, 0.002]),
+        (seed_texts.SPHERES, "cam1", "double_sphere", 380, [-0.2, 0.6]),
+        (seed_texts.SPHERES, "cam2", "eucm", 470, [0.6, 1.1]),
     ):
-        camera, _ = files.load_camera(path, name)
+        camera, _ = files.load_camera(write(tmp_path, data), name)
         assert camera.lenses == (lens,)
-        np.testing.assert_array_equal(camera.focal_px, [focal_px, focal_px + 1.5])
-        np.testing.assert_array_equal(camera.center_px, [639.7, 524.4])
+        assert float(camera.focal_px[0]) == focal_px
         np.testing.assert_array_equal(camera.distortion[: len(coefficients)], coefficients)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("[1.5, 1200", "[1200", "cam0.intrinsics: must be xi fu fv pu pv, got 4 numbers"),
-        ("[1.5, ", "[-0.5, ", "cam0.intrinsics: xi of the lens omni must be at least 0, got -0.5"),
-        ("0.6, 380", "1.6, 380", "cam1.intrinsics: alpha of the lens double_sphere must be from 0"),
-        ("1.1, 470", "1.1, -470", "cam2.intrinsics: the focal lengths must be > 0"),
-        ("model: radtan", "model: equi", "cam0.distortion_model: must be one of radtan, plumb_bob"),
-        (
-            "camera_model: ds",
-            "distortion_model: radtan\n  camera_model: ds",
-            "cam1.distortion_model: must",
-        ),
-    ],
-)
-def test_a_bad_lens_of_a_camchain_is_named_with_its_key(tmp_path, old, new, expected):
-    assert old in seed_texts.SPHERES
-    line = problem(
-        files.load_camera, write(tmp_path, seed_texts.SPHERES.replace(old, new, 1)), "cam0"
-    )
-    assert expected in line
 
 
 def test_a_camchain_is_chained(tmp_path):
@@ -528,70 +495,9 @@ def test_a_camchain_is_chained(tmp_path):
     np.testing.assert_allclose(again.Ts_camera_vehicle.as_matrix(), matrices, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        (
-            "camera_model: pinhole",
-            "camera_model: fov",
-            "cam0.camera_model: must be 'pinhole', 'omni', 'ds' or 'eucm', got the text 'fov'",
-        ),
-        ("0.001, 0.002]", "0]", "cam1.distortion_coeffs: must have 4 or 5 numbers, got 3"),
-        ("T_cam_imu", "T_imu", "cam0.T_cam_imu: missing"),
-        (
-            "    - [0, -1, 0, 0.1]",
-            "    - [0, 1, 0, 0.1]",
-            "cam0.T_cam_imu: the 3x3 part has det(R)",
-        ),
-        ("\ncam1:", "\ncam2:", "cam1: missing, though there is cam2"),
-    ],
-)
-def test_a_bad_camchain_is_named_with_its_key(tmp_path, old, new, expected):
-    assert old in KALIBR
-    assert expected in problem(files.load_rig, write(tmp_path, KALIBR.replace(old, new, 1)))
-
-
 def numbers(camera: Any) -> list[float]:
     assert not np.any(camera.distortion[5:])
     return np.concatenate([camera.focal_px, camera.center_px, camera.distortion[:5]]).tolist()
-
-
-def opencv_file(folder: Path, K: np.ndarray, distortion: list[float]) -> Path:
-    """As the installed OpenCV writes it."""
-    path = folder / "opencv.yaml"
-    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    store.write("image_width", 640)
-    store.write("image_height", 480)
-    store.write("camera_matrix", K)
-    store.write("distortion_coefficients", np.array([distortion]))
-    store.release()
-    return path
-
-
-def test_cameras_of_four_tools(tmp_path):
-    expected = [400.5, 401.0, 320.0, 240.0, 0.1, -0.02, 0.001, 0.002, 0.003]
-    K = np.array([[400.5, 0, 320.0], [0, 401.0, 240.0], [0, 0, 1]])
-    ros, size = files.load_camera(write(tmp_path, ROS))
-    assert (numbers(ros), ros.lenses, size) == (expected, ("radtan",), (640, 480))
-
-    opencv, size = files.load_camera(opencv_file(tmp_path, K, expected[4:]))
-    assert (numbers(opencv), opencv.lenses, size) == (expected, ("radtan",), (640, 480))
-    body = opencv_file(tmp_path, K, expected[4:]).read_text().split("\n", 1)[1]
-    for header in ("%YAML:1.0", "%YAML 1.2"):
-        again, _ = files.load_camera(write(tmp_path, f"{header}\n{body}"))
-        assert numbers(again) == expected
-    fisheye = opencv_file(tmp_path, K, expected[4:8]).read_text() + "fisheye_model: 1\n"
-    again, _ = files.load_camera(write(tmp_path, fisheye))
-    assert (numbers(again), again.lenses) == ([*expected[:8], 0], ("equidistant",))
-
-    matrices = {
-        "cameraIntrinsics": {"rows": 3, "cols": 3, "type": 6, "data": K.reshape(9).tolist()},
-        "distCoeffs": {"rows": 1, "cols": 8, "type": 6, "data": [*expected[4:], 0, 0, 0]},
-    }
-    photon = {"resolution": {"width": 640.0, "height": 480.0}, "observations": ["x" * 10**6]}
-    (tmp_path / "photon.json").write_text(json.dumps(photon | matrices))
-    again, size = files.load_camera(tmp_path / "photon.json")
-    assert (numbers(again), size) == (expected, (640, 480))
 
 
 def test_a_camera_is_chosen_by_name(tmp_path):
@@ -603,12 +509,43 @@ def test_a_camera_is_chosen_by_name(tmp_path):
     camera, _ = files.load_camera(write(tmp_path, KALIBR), "cam1")
     assert numbers(camera)[:2] == [400.0, 401.0]
     files.load_camera(write(tmp_path, ROS), "narrow")
-    assert "not named 'wide'" in problem(files.load_camera, write(tmp_path, ROS), "wide")
+    line = problem(files.load_camera, write(tmp_path, ROS), "wide")
+    assert line.endswith("has no camera 'wide': choose one of narrow")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
+VEHICLE, ROUTE = ((QCAR / name).read_text() for name in ("vehicle.yaml", "route.yaml"))
+TURNED = "    - [0, -1, 0, 0.1]", "    - [0, 1, 0, 0.1]"
+DS_BENT = "camera_model: ds", "distortion_model: radtan\n  camera_model: ds"
+TILTED = "cols: 5, data: [0.1,", "cols: 14, data: [0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0, 0, 0,"
+FOV = "cam0.camera_model: must be 'pinhole', 'omni', 'ds' or 'eucm', got the text 'fov'"
+ALPHA = "cam1.intrinsics: alpha of the lens double_sphere must be from 0"
+CHANGED = {
+    files.load_vehicle: (VEHICLE, [
+        ("wheelbase_m: 0.256", "wheelbase_m: 0", "wheelbase_m: must be > 0, got 0"),
+        ("wheelbase_m: 0.256", "", "wheelbase_m: missing"),
+        ("wheelbase_m:", "wheelbase:", "(and 1 more)"),
+        ("steering_limit_rad: 0.5", "steering_limit_rad: 30", "must be < 1.5708"),
+    ]),
+    files.load_route: (ROUTE, [
+        ("[[1.30, 0.0], [0.50, 0.65]]", "[]", "waypoints_m: must have at least 1"),
+        ("psi_deg: 125.0", "psi: 2", "start.psi_deg: missing"),
+    ]),
+    (lambda path: files.load_camera(path, "cam0")): (seed_texts.SPHERES, [
+        ("[1.5, 1200", "[1200", "cam0.intrinsics: must be xi fu fv pu pv, got 4 numbers"),
+        ("[1.5, ", "[-0.5, ", "cam0.intrinsics: xi of the lens omni must be at least 0, got -0.5"),
+        ("0.6, 380", "1.6, 380", ALPHA),
+        ("1.1, 470", "1.1, -470", "cam2.intrinsics: the focal lengths must be > 0"),
+        ("model: radtan", "model: equi", "cam0.distortion_model: must be one of radtan, plumb_bob"),
+        (*DS_BENT, "cam1.distortion_model: must"),
+    ]),
+    files.load_rig: (KALIBR, [
+        ("camera_model: pinhole", "camera_model: fov", FOV),
+        ("0.001, 0.002]", "0]", "cam1.distortion_coeffs: must have 4 or 5 numbers, got 3"),
+        ("T_cam_imu", "T_imu", "cam0.T_cam_imu: missing"),
+        (*TURNED, "cam0.T_cam_imu: the 3x3 part has det(R)"),
+        ("\ncam1:", "\ncam2:", "cam1: missing, though there is cam2"),
+    ]),
+    files.load_camera: (ROS, [
         ("[400.5,", "[0.0,", "camera_matrix.data[0]: is 0: this camera has not been calibrated"),
         ("[400.5,", "[-1,", "camera_matrix.data[0]: the focal length must be > 0, got -1"),
         ("[400.5, 0.0", "[400.5, 0.5", "camera_matrix.data: must be fx 0 cx, 0 fy cy, 0 0 1"),
@@ -616,16 +553,20 @@ def test_a_camera_is_chosen_by_name(tmp_path):
         ("plumb_bob", "mei", "distortion_model: must be one of plumb_bob"),
         ("plumb_bob", "equidistant", "distortion_coefficients.data: must be k1 k2 k3 k4"),
         ("image_width: 640", "", "image_width: missing"),
-        (
-            "cols: 5, data: [0.1,",
-            "cols: 14, data: [0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0, 0, 0,",
-            "has tilt coefficients that are not zero",
-        ),
-    ],
-)
-def test_a_bad_camera_info_is_named_with_its_key(tmp_path, old, new, expected):
-    assert old in ROS
-    assert expected in problem(files.load_camera, write(tmp_path, ROS.replace(old, new)))
+        (*TILTED, "has tilt coefficients that are not zero"),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("load", CHANGED, ids=["vehicle", "route", "spheres", "camchain", "ros"])
+def test_what_is_wrong_is_named_with_its_key(tmp_path, load):
+    sound, changes = CHANGED[load]
+    for old, new, expected in changes:
+        assert old in sound
+        path = write(tmp_path, sound.replace(old, new, 1))
+        line = problem(load, path)
+        assert line.startswith(f"{path}: ")
+        assert expected in line
 
 
 def test_json_is_as_strict_as_yaml(tmp_path):
@@ -658,21 +599,21 @@ def test_a_failed_write_leaves_the_older_file_and_nothing_else(tmp_path):
 
 
 def test_where_nothing_can_be_written_is_one_line(tmp_path):
-    assert "it is a folder" in problem(files.atomic_write, tmp_path, "x")
-    assert "no such file" in problem(files.atomic_write, tmp_path / "none" / "a", "x")
     files.atomic_write(tmp_path / "file", "x")
-    assert "can't be written" in problem(files.atomic_write, tmp_path / "file" / "a", "x")
-    assert "is a file, not a folder" in problem(files.output_folder, tmp_path / "file")
-    assert "is a file, not a folder" in problem(files.output_folder, tmp_path / "file" / "deep")
-    assert files.output_folder(tmp_path / "deep" / "er").is_dir()
-    assert files.output_folder(tmp_path / "deep" / "er").is_dir()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_closed_folder_is_one_line(tmp_path):
+    for path, expected in (
+        (tmp_path, "it is a folder"),
+        (tmp_path / "none" / "a", "no such file"),
+        (tmp_path / "file" / "a", "can't be written"),
+    ):
+        assert expected in problem(files.atomic_write, path, "x")
+    for path in (tmp_path / "file", tmp_path / "file" / "deep"):
+        assert "is a file, not a folder" in problem(files.output_folder, path)
+    for _ in range(2):
+        assert files.output_folder(tmp_path / "deep" / "er").is_dir()
     (tmp_path / "closed").mkdir(mode=0o500)
-    assert "permission denied" in problem(files.output_folder, tmp_path / "closed")
-    assert "permission denied" in problem(files.atomic_write, tmp_path / "closed" / "a", "x")
+    if os.geteuid():  # root may write everywhere
+        assert "permission denied" in problem(files.output_folder, tmp_path / "closed")
+        assert "permission denied" in problem(files.atomic_write, tmp_path / "closed" / "a", "x")
 
 
 def test_json_has_plain_numbers_and_no_nan(tmp_path):
@@ -689,18 +630,3 @@ def test_tum_is_translation_then_quaternion_with_w_last(tmp_path):
     np.testing.assert_allclose(row, [1532312185.929058, 1, 2, 3, 0.1, 0.2, 0.3, 0.5], atol=1e-6)
     with pytest.raises(ValueError, match="expected, got"):
         files.write_tum(tmp_path / "a.tum", np.array([1.0, 2.0]), Ts)
-
-
-@pytest.mark.parametrize("raw", [b"", b"no picture", np.zeros(0, np.uint8)])
-def test_bytes_that_are_no_image_are_none(raw):
-    assert decode_image(raw) is None
-
-
-def test_an_image_is_decoded_unless_nobody_has_memory_for_it():
-    pixels = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
-    raw = bytearray(cv2.imencode(".png", pixels)[1].tobytes())
-    np.testing.assert_array_equal(decode_image(bytes(raw)), pixels)
-    assert decode_image(np.frombuffer(raw, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (24, 32)
-    raw[16:24] = struct.pack(">II", 60_000, 60_000)  # its size, as its header says
-    raw[29:33] = struct.pack(">I", zlib.crc32(raw[12:29]))
-    assert decode_image(bytes(raw)) is None

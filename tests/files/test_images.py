@@ -167,7 +167,9 @@ def test_what_is_no_picture_is_said_to_be_none(tmp_path: Path) -> None:
         "a.heic": b"\0\0\0\x18ftypheic" + bytes(64),
         "b.jpg": b"\xff\xd8\xff\xe1\0\x20Exif\0\0MM\0*" + b"\xff" * 40,
         "c.png": b"",
+        "d.png": b"no picture",
     }.items():
+        assert decode_image(raw) is None
         (tmp_path / name).write_bytes(raw)
         with pytest.raises(BadInput, match=name):
             read_image(tmp_path / name)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from jaxnav.core.filter.choose import PaperCost, Ungated
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, parameters_of
-from jaxnav.errors import BadInput
 from jaxnav.files import Params, apply_params, calib_dir, load_params, write_params
 from tests import worlds
+from tests.helpers.bad_input import problem
 
 RIG, MARKERS, QCAR = worlds.qcar_rig_by_hand(), worlds.paper_markers(), worlds.qcar_by_hand()
 CAR = Navigator(RIG, MARKERS, QCAR, worlds.WAYPOINTS_M)
@@ -24,15 +24,6 @@ PARKED = Navigator(RIG, MARKERS, QCAR)  # a car that goes nowhere has no control
 FREE = Navigator(RIG, MARKERS)
 NAVIGATORS = {"car": CAR, "parked": PARKED, "free": FREE}
 WHERE = Path("p.yaml")
-
-
-def problem(call, *args) -> str:
-    """The one line that a person gets."""
-    with pytest.raises(BadInput) as caught:
-        call(*args)
-    line = str(caught.value)
-    assert "\n" not in line
-    return line
 
 
 def written(folder: Path, text: str) -> Path:
@@ -209,82 +200,56 @@ def test_provenance_is_kept_and_shown(tmp_path):
 # --- what is wrong with a file by itself ----------------------------------------------------------
 
 NEAREST = f"of {len(TUNABLES)} names the nearest are"
-FLOOR = "parameters.motion.vision_floor"
-GATE = "parameters.motion.gate_nis"
+FLOOR, GATE = ".motion.vision_floor", ".motion.gate_nis"
 
 
-@pytest.mark.parametrize(
-    ("parameters", "line"),
-    [
-        ("{}", "parameters: must have at least 1 entries, got 0"),
-        (
-            "{speed: 1}",
-            f"parameters.speed: unknown: {NEAREST} controller.speed_mps, selector.floor_rad, "
-            "selector.floor_m",
-        ),
-        ("{motion: {vision_floor: 1}}", f"parameters.motion: unknown: {NEAREST} motion."),
-        ("{corner_sigma_px: big}", "parameters.corner_sigma_px: must be a number, got the text"),
-        ("{corner_sigma_px: {a: 1}}", "parameters.corner_sigma_px: must be a number, got {'a'"),
-        ("{corner_sigma_px: 0}", "parameters.corner_sigma_px: must be > 0, got 0"),
-        ("{corner_sigma_px: 1e-19}", "parameters.corner_sigma_px: must be at least 1e-18, got 1e"),
-        ("{corner_sigma_px: 2e9}", "parameters.corner_sigma_px: must be from -1e+09 to 1e+09, got"),
-        ("{corner_sigma_px: .nan}", "parameters.corner_sigma_px: must be finite, got nan"),
-        ("{motion.gate_nis: .nan}", f"{GATE}: must be > 0 and finite, or .inf for none, got nan"),
-        ("{motion.gate_nis: 0}", f"{GATE}: must be > 0, got 0"),
-        ("{motion.gate_nis: [1, .inf]}", f"{GATE}[1]: must be finite, got inf"),
-        ("{motion.vision_floor: []}", f"{FLOOR}: must have 1 to 64 entries, got 0"),
-        (f"{{motion.vision_floor: {[1] * 65}}}", f"{FLOOR}: must have 1 to 64 entries, got 65"),
-        ("{motion.vision_floor: [1, -1, 1]}", f"{FLOOR}[1]: must be > 0, got -1"),
-        (
-            "{motion.vision_floor: [[1, 0], [0, 1], [0, 0]]}",
-            f"{FLOOR}[0]: must have 3 numbers, as the matrix has 3 rows, got 2 numbers",
-        ),
-        ("{motion.vision_floor: [[1, 0], 1]}", f"{FLOOR}[1]: must have 2 numbers, as the matrix"),
-        ("{motion.vision_floor: [[[1]]]}", f"{FLOOR}[0][0]: must be a number, got [1]"),
-        ("{motion.vision_floor: [[1, 0], [0, 0]]}", f"{FLOOR}[1][1]: a variance must be at least"),
-        (
-            "{motion.vision_floor: [[1, 0.5], [0.4, 1]]}",
-            f"{FLOOR}[0][1]: must equal [1][0], 0.4, in a symmetric matrix, got 0.5",
-        ),
-        (
-            "{motion.vision_floor: [[1e-6, 2e-3], [2e-3, 1]]}",
-            f"{FLOOR}: must be positive definite: the least eigenvalue of its correlations is -1,",
-        ),
-        (
-            "{motion.vision_floor: [[1e-6, 1e-3], [1e-3, 1]]}",
-            f"{FLOOR}: must be positive definite: the least eigenvalue of its correlations is 0,",
-        ),
-        (
-            "{motion.initial_velocity_sigma: [[1, 0], [0, 1]]}",
-            "parameters.motion.initial_velocity_sigma: can't be a matrix: it is a number, or a",
-        ),
-        (
-            "{rig.extrinsics_sigma: [[0.01, 0.01, 0.01, 0.02, 0.02]]}",
-            "parameters.rig.extrinsics_sigma[0]: must have 6 numbers, got 5",
-        ),
-        (
-            "{motion.vehicle.sensor_sigma: [0.03, 0.03, 0.5, 0.02]}",
-            "parameters.motion.vehicle.sensor_sigma[2]: must be at most 0.35, got 0.5",
-        ),
-    ],
-)
-def test_a_bad_parameter_is_named_with_its_key(parameters, line, tmp_path):
-    path = written(tmp_path, f"parameters: {parameters}\n")
-    assert problem(load_params, path).startswith(f"{path}: {line}")
+SQUARE = "must have 3 numbers, as the matrix has 3 rows, got 2 numbers"
+LEAST = "must be positive definite: the least eigenvalue of its correlations is"
+SIGMA = "corner_sigma_px"
+BAD = [
+    ("{}", ": must have at least 1 entries, got 0"),
+    ("{speed: 1}", f".speed: unknown: {NEAREST} controller.speed_mps, selector.floor_rad, sel"),
+    ("{motion: {vision_floor: 1}}", f".motion: unknown: {NEAREST} motion."),
+    (f"{{{SIGMA}: big}}", f".{SIGMA}: must be a number, got the text"),
+    (f"{{{SIGMA}: {{a: 1}}}}", f".{SIGMA}: must be a number, got {{'a'"),
+    (f"{{{SIGMA}: 0}}", f".{SIGMA}: must be > 0, got 0"),
+    (f"{{{SIGMA}: 1e-19}}", f".{SIGMA}: must be at least 1e-18, got 1e"),
+    (f"{{{SIGMA}: 2e9}}", f".{SIGMA}: must be from -1e+09 to 1e+09, got"),
+    (f"{{{SIGMA}: .nan}}", f".{SIGMA}: must be finite, got nan"),
+    ("{motion.gate_nis: .nan}", f"{GATE}: must be > 0 and finite, or .inf for none, got nan"),
+    ("{motion.gate_nis: 0}", f"{GATE}: must be > 0, got 0"),
+    ("{motion.gate_nis: [1, .inf]}", f"{GATE}[1]: must be finite, got inf"),
+    ("{motion.vision_floor: []}", f"{FLOOR}: must have 1 to 64 entries, got 0"),
+    (f"{{motion.vision_floor: {[1] * 65}}}", f"{FLOOR}: must have 1 to 64 entries, got 65"),
+    ("{motion.vision_floor: [1, -1, 1]}", f"{FLOOR}[1]: must be > 0, got -1"),
+    ("{motion.vision_floor: [[1, 0], [0, 1], [0, 0]]}", f"{FLOOR}[0]: {SQUARE}"),
+    ("{motion.vision_floor: [[1, 0], 1]}", f"{FLOOR}[1]: must have 2 numbers, as the matrix"),
+    ("{motion.vision_floor: [[[1]]]}", f"{FLOOR}[0][0]: must be a number, got [1]"),
+    ("{motion.vision_floor: [[1, 0], [0, 0]]}", f"{FLOOR}[1][1]: a variance must be at least"),
+    ("{motion.vision_floor: [[1, 0.5], [0.4, 1]]}",
+     f"{FLOOR}[0][1]: must equal [1][0], 0.4, in a symmetric matrix, got 0.5"),
+    ("{motion.vision_floor: [[1e-6, 2e-3], [2e-3, 1]]}", f"{FLOOR}: {LEAST} -1,"),
+    ("{motion.vision_floor: [[1e-6, 1e-3], [1e-3, 1]]}", f"{FLOOR}: {LEAST} 0,"),
+    ("{motion.initial_velocity_sigma: [[1, 0], [0, 1]]}",
+     ".motion.initial_velocity_sigma: can't be a matrix: it is a number, or a"),
+    ("{rig.extrinsics_sigma: [[0.01, 0.01, 0.01, 0.02, 0.02]]}",
+     ".rig.extrinsics_sigma[0]: must have 6 numbers, got 5"),
+    ("{motion.vehicle.sensor_sigma: [0.03, 0.03, 0.5, 0.02]}",
+     ".motion.vehicle.sensor_sigma[2]: must be at most 0.35, got 0.5"),
+]  # fmt: skip
+BAD_FILES = [
+    ("", "the file is empty"),
+    (f"parameters: {{{SIGMA}: 1}}\nprovenance: me", "provenance: must be a mapping"),
+    (f"parameters: {{{SIGMA}: 1}}\ndate: 1", "date: unknown key: expected parameters, "),
+    (f"parameters: {{{SIGMA}: 1, {SIGMA}: 2}}", "is not valid YAML: line 1: dupl"),
+]
 
 
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("", "the file is empty"),
-        ("parameters: {corner_sigma_px: 1}\nprovenance: me", "provenance: must be a mapping"),
-        ("parameters: {corner_sigma_px: 1}\ndate: 1", "date: unknown key: expected parameters, "),
-        ("parameters: {corner_sigma_px: 1, corner_sigma_px: 2}", "is not valid YAML: line 1: dupl"),
-    ],
-)
-def test_a_bad_file_is_one_line(text, line, tmp_path):
-    path = written(tmp_path, text)
-    assert problem(load_params, path).startswith(f"{path}: {line}")
+def test_a_bad_parameter_is_named_with_its_key(tmp_path):
+    texts = [(f"parameters: {values}\n", f"parameters{line}") for values, line in BAD]
+    for text, line in [*texts, *BAD_FILES]:
+        path = written(tmp_path, text)
+        assert problem(load_params, path).startswith(f"{path}: {line}")
 
 
 def test_what_could_not_be_read_is_not_written(tmp_path):
@@ -335,49 +300,22 @@ def test_one_file_serves_every_selector_and_what_is_not_driven():
         }
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "line"),
-    [
-        (
-            "free",
-            {"motion.odometry_sigma": [1, 1, 1]},
-            "motion.odometry_sigma: this navigator has no such number (its motion model is "
-            "ConstantVelocity): expected one of motion.acceleration_density, motion.vision_floor,",
-        ),
-        (
-            "free",
-            {"motion.vision_floor": [1, 1, 1]},
-            "motion.vision_floor: must have 6 entries or 6 rows of 6, got 3 entries",
-        ),
-        (
-            "car",
-            {"motion.initial_velocity_sigma": [1] * 6},
-            "motion.initial_velocity_sigma: must have 3 entries, got 6 entries",
-        ),
-        (
-            "car",
-            {"motion.acceleration_density": np.eye(6)},
-            "motion.acceleration_density: must have 3 entries or 3 rows of 3, got 6 rows of 6",
-        ),
-        (
-            "car",
-            {"motion.vision_floor": 1},
-            "motion.vision_floor: must have 3 entries or 3 rows of 3, got a number",
-        ),
-        (
-            "car",
-            {"rig.extrinsics_sigma": [[0.01] * 6] * 3},
-            "rig.extrinsics_sigma: must have 4 rows of 6, got 3 rows of 6",
-        ),
-        (
-            "free",
-            {"motion.vehicle.sensor_sigma": [0.01] * 4},
-            "motion.vehicle.sensor_sigma: this navigator has no such number",
-        ),
-        ("car", {"corner_sigma_px": [1]}, "corner_sigma_px: must be a number, got 1 entry"),
-    ],
-)
-def test_what_does_not_fit_is_named_with_its_key(kind, values, line):
-    params = Params.from_values(values, WHERE)
-    found = problem(apply_params, NAVIGATORS[kind], params)
-    assert found.startswith(f"p.yaml: parameters.{line}")
+MISFITS = [
+    ("free", "motion.odometry_sigma", [1, 1, 1],
+     "this navigator has no such number (its motion model is ConstantVelocity): expected one of "
+     "motion.acceleration_density, motion.vision_floor,"),
+    ("free", "motion.vision_floor", [1] * 3, "must have 6 entries or 6 rows of 6, got 3 entries"),
+    ("car", "motion.initial_velocity_sigma", [1] * 6, "must have 3 entries, got 6 entries"),
+    ("car", "motion.acceleration_density", np.eye(6),
+     "must have 3 entries or 3 rows of 3, got 6 rows of 6"),
+    ("car", "motion.vision_floor", 1, "must have 3 entries or 3 rows of 3, got a number"),
+    ("car", "rig.extrinsics_sigma", [[0.01] * 6] * 3, "must have 4 rows of 6, got 3 rows of 6"),
+    ("free", "motion.vehicle.sensor_sigma", [0.01] * 4, "this navigator has no such number"),
+    ("car", "corner_sigma_px", [1], "must be a number, got 1 entry"),
+]  # fmt: skip
+
+
+def test_what_does_not_fit_is_named_with_its_key():
+    for kind, name, value, line in MISFITS:
+        found = problem(apply_params, NAVIGATORS[kind], Params.from_values({name: value}, WHERE))
+        assert found.startswith(f"p.yaml: parameters.{name}: {line}")

@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 
 from jaxnav.files import private
-from jaxnav.files.private import NotPrivateError, PrivateFolder
+from jaxnav.files.private import (
+    NotPrivateError,
+    private_folder,
+    read_private,
+    require_own_entries,
+    write_private,
+)
 
 SOMEBODY = 12345
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
@@ -18,15 +24,13 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can give fi
 def folder(tmp_path) -> Path:
     """With a file in it."""
     path = tmp_path / "outer" / "inner"
-    with PrivateFolder(path, make=True) as made:
-        made.write("one", b"content")
+    write_private(private_folder(path, make=True) / "one", b"content")
     return path
 
 
 def read(path: Path) -> bytes:
-    with PrivateFolder(path) as found:
-        found.require_own_entries()
-        return found.read("one")
+    require_own_entries(found := private_folder(path))
+    return read_private(found / "one")
 
 
 def test_what_is_written_is_read_and_is_this_users_alone(folder):
@@ -34,10 +38,7 @@ def test_what_is_written_is_read_and_is_this_users_alone(folder):
     for path in (folder.parent, folder):
         assert path.stat().st_mode & 0o777 == 0o700
     assert (folder / "one").stat().st_mode & 0o777 == 0o600
-    with PrivateFolder(folder) as found:
-        found.write("one", b"newer")
-        assert found.holds("one")
-        assert not found.holds("two")
+    write_private(private_folder(folder) / "one", b"newer")
     assert read(folder) == b"newer"
     assert [path.name for path in folder.iterdir()] == ["one"]
 
@@ -93,22 +94,19 @@ def test_a_link_in_the_root_folder_is_followed(monkeypatch, folder):
     linked = Path("/", folder.parts[1])
     monkeypatch.setattr(Path, "is_symlink", lambda path: path == Path("/short"))
     monkeypatch.setattr(Path, "readlink", lambda path: linked.relative_to("/"))
-    with PrivateFolder(Path("/short", *folder.parts[2:])) as found:
-        assert found.path == folder
+    assert private_folder(Path("/short", *folder.parts[2:])) == folder
 
 
 def test_no_file_and_no_folder(folder, tmp_path):
     (folder / "pipe").unlink(missing_ok=True)
     os.mkfifo(folder / "pipe", 0o600)
     (folder / "deep").mkdir(mode=0o700)
-    with PrivateFolder(folder) as found:
-        for name in ("pipe", "deep", "missing"):
-            assert not found.holds(name)
-            with pytest.raises(OSError):  # noqa: PT011
-                found.read(name)
+    for name in ("pipe", "deep", "missing"):
+        with pytest.raises(OSError):  # noqa: PT011
+            read_private(private_folder(folder) / name)
     for path in (folder / "one", folder / "one" / "more", tmp_path / "missing"):
         with pytest.raises(OSError):  # noqa: PT011
-            PrivateFolder(path)
+            private_folder(path)
 
 
 def test_a_large_file_is_not_read(folder, monkeypatch):
@@ -122,8 +120,7 @@ def test_what_a_killed_process_has_left_is_removed_and_a_living_one_keeps_its_ow
     for path in (left, living):
         path.write_bytes(b"half")
     os.utime(left, (0, 0))
-    with PrivateFolder(folder) as found:
-        found.write("two", b"2")
+    write_private(private_folder(folder) / "two", b"2")
     assert {path.name for path in folder.iterdir()} == {"one", "two", living.name}
     assert read(folder) == b"content"
 
@@ -132,13 +129,13 @@ def test_what_a_killed_process_has_left_is_removed_and_a_living_one_keeps_its_ow
 WRITERS = """
 import os, sys
 from pathlib import Path
-from jaxnav.files.private import PrivateFolder
+from jaxnav.files.private import private_folder, write_private
 
 for letter in (b"a", b"b"):
     if os.fork() == 0:
-        with PrivateFolder(Path(sys.argv[1]), make=True) as folder:
-            for _ in range(200):
-                folder.write("one", letter * 10_000)
+        folder = private_folder(Path(sys.argv[1]), make=True)
+        for _ in range(200):
+            write_private(folder / "one", letter * 10_000)
         os._exit(0)
 assert [os.wait()[1] for _ in "ab"] == [0, 0]
 """

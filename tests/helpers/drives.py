@@ -191,7 +191,7 @@ def record_drive(recorder, count: int) -> None:
     for index in range(count):
         given = make_input(index)
         recorder.put(*input_message(given))
-        message = outcome_message(make_outcome(index), f"digest {index}")
+        message = outcome_message(make_outcome(index)) | {"digest": f"digest {index}"}
         recorder.put("/outcome", given.now_ns, message)
         if index % 10 == 0:
             recorder.image("/camera/front", given.now_ns, make_picture(index))

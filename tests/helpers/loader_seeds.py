@@ -182,7 +182,7 @@ def _base_drive(folder: Path) -> Path:
         given = make_base_input(index)
         recorder.put(*input_message(given))
         outcome = dataclasses.replace(make_outcome(index), twist=(0.1 * index, -0.2, 0.3))
-        recorder.put("/outcome", given.now_ns, outcome_message(outcome, f"digest {index}"))
+        recorder.put("/outcome", given.now_ns, outcome_message(outcome))
     recorder.close()
     return recorder.path
 

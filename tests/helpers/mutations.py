@@ -43,25 +43,12 @@ class Changed:
         return not words or any(word in line for word in words)
 
 
-def edited(raw: bytes) -> st.SearchStrategy[bytes]:
-    """Bytes with a few changed, put in, taken out or repeated, or cut short."""
-    kinds = st.sampled_from(_EDITS)
-    edit = st.tuples(kinds, st.integers(0, len(raw)), st.binary(min_size=1, max_size=8))
-    return st.lists(edit, min_size=1, max_size=3).map(lambda edits: _edited(raw, edits))
-
-
 def edited_by(rng: Random, raw: bytes) -> bytes:
-    """The same, by a plain generator."""
-    edits = [
-        (rng.choice(_EDITS), rng.randint(0, len(raw)), rng.randbytes(rng.randint(1, 8)))
-        for _ in range(rng.randint(1, 3))
-    ]
-    return _edited(raw, edits)
-
-
-def _edited(raw: bytes, edits: Sequence[tuple[str, int, bytes]]) -> bytes:
+    """Bytes with a few changed, put in, taken out or repeated, or cut short."""
     changed = bytearray(raw)
-    for kind, place, new in edits:
+    for _ in range(rng.randint(1, 3)):
+        kind, place = rng.choice(_EDITS), rng.randint(0, len(raw))
+        new = rng.randbytes(rng.randint(1, 8))
         end = place + len(new)
         if kind == "change":
             changed[place:end] = new

@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
-from jaxnav.drive.flags import Fault
 from jaxnav.errors import BadInput
 from jaxnav.recordings.drive_format import encode, header_metadata
 from jaxnav.recordings.drive_log import DriveLog, read_drive
 from jaxnav.recordings.recorder import Recorder
-from jaxnav.recordings.records import MESSAGES, input_message, json_schema
+from jaxnav.recordings.records import MESSAGES, json_schema
 from tests.helpers.bombs import in_chunks as in_chunks_of
 from tests.helpers.drives import (
     BEGIN_NS,
@@ -68,20 +65,13 @@ def test_who_waits_is_told_how_far_it_is(path):
 def test_outcomes_are_tables(whole):
     outcomes = whole.outcomes
     expected = [make_outcome(index) for index in range(COUNT)]
-    output, belief = expected[0].output, expected[0].belief.bank
     np.testing.assert_array_equal(outcomes.now_ns, BEGIN_NS + PERIOD_NS * np.arange(COUNT))
     np.testing.assert_allclose(outcomes.times_s, 0.01 * np.arange(COUNT))
     np.testing.assert_array_equal(outcomes.throttle, [one.throttle for one in expected])
-    assert set(outcomes.faults) == {Fault.NO_MARKER | Fault.CAMERA_STALE}
-    np.testing.assert_array_equal(outcomes.pose, np.tile(output.pose, (COUNT, 1)))
     assert outcomes.covariance.shape == (COUNT, 6, 6)
-    np.testing.assert_array_equal(outcomes.covariance[5], output.covariance)
-    assert outcomes.located.all()
-    np.testing.assert_array_equal(outcomes.hypotheses[2], belief.mean[1:3, :3])
-    assert outcomes.Ts_vehicle_world[2].shape == (2, 7)
+    np.testing.assert_array_equal(outcomes.covariance[5], expected[5].output.covariance)
     np.testing.assert_array_equal(outcomes.costs[2], [0.5, np.inf])
     assert outcomes.digest[3] == "digest 3"
-    assert outcomes.reason[3] == "the loop was away"
 
 
 def test_what_an_outcome_does_not_report_is_missing(tmp_path):
@@ -98,10 +88,10 @@ def test_what_an_outcome_does_not_report_is_missing(tmp_path):
 
 
 def test_images_are_read_when_they_are_asked_for(whole):
-    images = list(whole.images("/camera/front"))
+    images = list(whole.images())
     assert [image.stamp_ns for image in images] == [make_input(i).now_ns for i in (0, 10, 20)]
     assert all(image.jpeg.startswith(b"\xff\xd8") for image in images)
-    assert list(whole.images("/camera/rear")) == []
+    assert {image.topic for image in images} == {"/camera/front"}
 
 
 def test_a_drive_without_anything(tmp_path):
@@ -200,41 +190,6 @@ def test_any_changed_byte_means_the_same_or_is_noticed(in_chunks, whole, tmp_pat
     assert noticed > 300
 
 
-EDITS = st.lists(
-    st.tuples(
-        st.sampled_from(["change", "insert", "remove", "repeat"]),
-        st.integers(0, 10**6),
-        st.binary(min_size=1, max_size=9),
-    ),
-    min_size=1,
-    max_size=4,
-)
-
-
-@settings(max_examples=150, derandomize=True)
-@given(EDITS)
-def test_whatever_a_file_holds_it_is_a_drive_or_bad_input(in_chunks, tmp_path_factory, edits):
-    raw = bytearray(in_chunks)
-    for kind, where, new in edits:
-        place = where % (len(raw) + 1)
-        if kind == "change":
-            raw[place : place + len(new)] = new
-        elif kind == "insert":
-            raw[place:place] = new
-        elif kind == "remove":
-            del raw[place : place + 50 * len(new)]
-        else:
-            raw[place:place] = raw[place : place + 100 * len(new)]
-    path = tmp_path_factory.getbasetemp() / "edited.mcap"
-    path.write_bytes(raw)
-    try:
-        log = read_drive(path)
-        list(log.images())
-    except BadInput:
-        return
-    assert isinstance(log, DriveLog)
-
-
 def _file(tmp_path: Path, *messages, header: dict | None = None, **options) -> Path:
     """A sound MCAP file of (topic, message, raw bytes instead, schema's name instead)."""
     path = tmp_path / "drive.mcap"
@@ -252,28 +207,9 @@ def _file(tmp_path: Path, *messages, header: dict | None = None, **options) -> P
 TICK = {"now_ns": 1, "faults": []}
 
 
-@settings(max_examples=200, derandomize=True)
-@given(st.integers(0, 10**6), st.binary(max_size=4), st.integers(0, 6), st.integers(0, 3))
-def test_messages_that_are_damaged_under_sound_checksums(tmp_path_factory, where, new, out, which):
-    """As another program could write them: the checks of the messages alone are left."""
-    tmp_path = tmp_path_factory.getbasetemp()
-    inputs = [input_message(make_input(index))[::2] for index in range(3)]
-    topic, message = [*inputs, ("/outcome", OUTCOME | REPORTED)][which]
-    raw = bytearray(encode(message))
-    place = where % len(raw)
-    raw[place : place + out] = new
-    path = _file(tmp_path, (topic, None, bytes(raw)))
-    try:
-        log = read_drive(path)
-    except BadInput as error:
-        assert str(error).startswith(f"{path}: {topic}[0]")  # noqa: PT017
-    else:
-        assert len(log.inputs) + len(log.outcomes.now_ns) == 1
-
-
-@pytest.mark.parametrize(
-    ("messages", "problem"),
-    [
+def test_wrong_messages_are_named(tmp_path):
+    sized = [("/outcome", OUTCOME | REPORTED | {"covariance": [0.0] * n}) for n in (9, 4)]
+    for messages, problem in [
         ([("/tick", TICK, None, "jaxnav.Tock")], "/tick: expected jaxnav.Tick in json, got"),
         ([("/tick", TICK), ("/tick", {"now_ns": 1})], r"/tick\[1\].faults: missing"),
         ([("/tick", TICK, b"{")], r"/tick\[0\]: is not valid JSON"),
@@ -281,45 +217,30 @@ def test_messages_that_are_damaged_under_sound_checksums(tmp_path_factory, where
         ([("/odometry", TICK)], r"/odometry\[0\].stamp_ns: missing"),
         ([("/frames", TICK | {"frames": []})], r"/frames\[0\].frames: must have at least 1"),
         ([("/outcome", OUTCOME | {"health": "FINE"})], r"/outcome\[0\].health: unknown word"),
-        (
-            [
-                ("/outcome", OUTCOME | REPORTED),
-                ("/outcome", OUTCOME | REPORTED | {"covariance": [0.0] * 4}),
-            ],
-            r"/outcome.covariance: differ in size: \[2, 3\]",
-        ),
-    ],
-)
-def test_wrong_messages_are_named(tmp_path, messages, problem):
-    path = _file(tmp_path, *messages)
-    with pytest.raises(BadInput, match=problem) as error:
-        read_drive(path)
-    assert str(error.value).startswith(f"{path}: ")
+        (sized, r"/outcome.covariance: differ in size: \[2, 3\]"),
+    ]:
+        path = _file(tmp_path, *messages)
+        with pytest.raises(BadInput, match=f"^{path}: {problem}"):
+            read_drive(path)
 
 
-def test_a_newer_format_is_named(tmp_path):
-    newer = header_metadata({}) | {"format_version": "7"}
-    with pytest.raises(
-        BadInput, match="format_version: this program reads format 1, the file has 7"
-    ):
-        read_drive(_file(tmp_path, header=newer))
-
-
-def test_files_that_are_no_drive_are_named(tmp_path):
-    with pytest.raises(BadInput, match=r"missing.mcap: can't be read: no such file"):
-        read_drive(tmp_path / "missing.mcap")
-    with pytest.raises(BadInput, match="is a folder, not a file"):
-        read_drive(tmp_path)
-    for content in (b"", b"\x89MCAP", b"PK\x03\x04 some other file", bytes(1000)):
-        (tmp_path / "other.mcap").write_bytes(content)
-        with pytest.raises(BadInput, match=r"other.mcap: is not an MCAP file"):
-            read_drive(tmp_path / "other.mcap")
-    with (tmp_path / "foreign.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.finish()
-    with pytest.raises(BadInput, match=r"foreign.mcap: is no recorded drive"):
-        read_drive(tmp_path / "foreign.mcap")
+def test_files_that_are_no_drive_are_named(in_chunks, tmp_path):
+    foreign = io.BytesIO()
+    writer = Writer(foreign)
+    writer.start()
+    writer.finish()
+    lz4 = _file(tmp_path, ("/tick", TICK), compression=CompressionType.LZ4).read_bytes()
+    no_mcap = b"", b"\x89MCAP", b"PK\x03\x04 some other file", bytes(1000)
+    path = tmp_path / "drive.mcap"
+    for content, problem in [
+        *((raw, "is not an MCAP file") for raw in no_mcap),
+        (foreign.getvalue(), "is no recorded drive"),
+        (lz4, "is damaged .*compressed by 'lz4', only zstd is read"),
+        (in_chunks[:60], "is cut off before its header"),
+    ]:
+        path.write_bytes(content)
+        with pytest.raises(BadInput, match=rf"drive.mcap: {problem}"):
+            read_drive(path)
 
 
 def test_other_ways_to_write_mcap_are_read(tmp_path):
@@ -329,36 +250,21 @@ def test_other_ways_to_write_mcap_are_read(tmp_path):
         assert [given.now_ns for given in log.inputs] == [0, 1, 2, 3, 4]
 
 
-def test_lz4_is_refused(tmp_path):
-    path = _file(tmp_path, ("/tick", TICK), compression=CompressionType.LZ4)
-    with pytest.raises(BadInput, match="compressed by 'lz4', only zstd is read"):
-        read_drive(path)
-
-
-def test_a_file_cut_off_before_its_header_is_named(in_chunks, tmp_path):
-    (tmp_path / "cut.mcap").write_bytes(in_chunks[:60])
-    with pytest.raises(BadInput, match=r"cut.mcap: is cut off before its header"):
-        read_drive(tmp_path / "cut.mcap")
-
-
 def test_what_grows_without_bounds_is_refused(tmp_path):
     bomb = functools.partial(in_chunks_of, tmp_path / "bomb.mcap")
-    large = zstandard.compress(bytes(65 * 2**20))
-    chunk = Chunk("zstd", large, 0, 0, 0, 65 * 2**20)
-    with pytest.raises(BadInput, match="a chunk of 68157440 bytes"):
-        read_drive(bomb(chunk))
-    with pytest.raises(BadInput, match="larger than it says"):
-        read_drive(bomb(dataclasses.replace(chunk, uncompressed_size=1000)))
-    unsaid = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(65 * 2**20))
-    with pytest.raises(BadInput, match="is damaged"):
-        read_drive(
-            in_chunks_of(
-                tmp_path / "bomb.mcap",
-                dataclasses.replace(chunk, data=unsaid, uncompressed_size=1000),
-            )
-        )
+    large = bytes(65 * 2**20)
+    chunk = Chunk("zstd", zstandard.compress(large), 0, 0, 0, len(large))
+    unsaid = zstandard.ZstdCompressor(write_content_size=False).compress(large)
+    small = dataclasses.replace(chunk, uncompressed_size=1000)
+    for one, problem in [
+        (chunk, "a chunk of 68157440 bytes"),
+        (small, "larger than it says"),
+        (dataclasses.replace(small, data=unsaid), "is damaged"),
+    ]:
+        with pytest.raises(BadInput, match=problem):
+            read_drive(bomb(one))
     path = bomb(chunk)
-    header_ends = path.read_bytes().index(b"\x0c")
-    path.write_bytes(path.read_bytes()[:header_ends] + b"\x0c" + (2**40).to_bytes(8, "little"))
+    head, *_ = path.read_bytes().partition(b"\x0c")
+    path.write_bytes(head + b"\x0c" + (2**40).to_bytes(8, "little"))
     with pytest.raises(BadInput, match=r"is damaged .* exceeds limit"):
         read_drive(path)

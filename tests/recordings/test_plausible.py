@@ -13,8 +13,6 @@ from jaxnav.recordings.records import OUTCOME
 from tests.fuzz.seeds import drive_parts, write_drive
 from tests.recordings.test_regression import FOLDER
 
-ODD = [1e308, -1e300, 1e12, math.inf, math.nan]
-
 
 @pytest.fixture(scope="module")
 def parts():
@@ -37,15 +35,15 @@ def test_of_a_sound_drive_nothing_is_left_out(outcomes):
             np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("value", ODD)
-def test_an_outcome_that_is_nowhere_is_not_located(outcomes, value):
-    pose = outcomes.pose.copy()
-    pose[-1, 1] = value
-    shown, odd = keep_plausible(dataclasses.replace(outcomes, pose=pose))
-    assert odd == 1
-    assert not shown.located[-1]
-    assert np.isnan(shown.pose[-1]).all()
-    assert shown.located[:-1].tolist() == outcomes.located[:-1].tolist()
+def test_an_outcome_that_is_nowhere_is_not_located(outcomes):
+    for value in (1e308, -1e300, 1e12, math.inf, math.nan):
+        pose = outcomes.pose.copy()
+        pose[-1, 1] = value
+        shown, odd = keep_plausible(dataclasses.replace(outcomes, pose=pose))
+        assert odd == 1
+        assert not shown.located[-1]
+        assert np.isnan(shown.pose[-1]).all()
+        assert shown.located[:-1].tolist() == outcomes.located[:-1].tolist()
 
 
 KEYS = [

@@ -1,6 +1,5 @@
 """The recorder writes its input, and no caller waits for it, whatever happens to the disk."""
 
-import errno
 import json
 import os
 import resource
@@ -9,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
@@ -53,28 +53,17 @@ def test_other_programs_can_read_the_file(tmp_path):
     assert (recorder.written, recorder.dropped, recorder.failed) == (63, 0, None)
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
-        counts = {
-            reader.get_summary().channels[channel].topic: count
-            for channel, count in reader.get_summary().statistics.channel_message_counts.items()
-        }
-        assert counts == {
-            "/odometry": 10,
-            "/frames": 10,
-            "/tick": 10,
-            "/outcome": 30,
-            "/camera/front": 3,
-        }
         [metadata] = reader.iter_metadata()
         assert metadata.name == "jaxnav.drive"
         assert json.loads(metadata.metadata["header"]) == {"rig": "a rig"}
         messages = list(reader.iter_messages(log_time_order=False))
-    names = {channel.topic: schema.name for schema, channel, _ in messages}
-    assert names == {
-        "/odometry": "jaxnav.Odometry",
-        "/frames": "jaxnav.Frames",
-        "/tick": "jaxnav.Tick",
-        "/outcome": "jaxnav.Outcome",
-        "/camera/front": "foxglove.CompressedImage",
+    counts = Counter((channel.topic, schema.name) for schema, channel, _ in messages)
+    assert counts == {
+        ("/odometry", "jaxnav.Odometry"): 10,
+        ("/frames", "jaxnav.Frames"): 10,
+        ("/tick", "jaxnav.Tick"): 10,
+        ("/outcome", "jaxnav.Outcome"): 30,
+        ("/camera/front", "foxglove.CompressedImage"): 3,
     }
     for schema, channel, message in messages:
         assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
@@ -85,9 +74,9 @@ def test_other_programs_can_read_the_file(tmp_path):
             assert message.publish_time == content["stamp_ns"] == message.log_time - 7
     in_order = [m.log_time for _, channel, m in messages if channel.topic != "/camera/front"]
     assert in_order == sorted(in_order)
-    for topic in counts:
+    for (topic, _), count in counts.items():
         sequences = [m.sequence for _, channel, m in messages if channel.topic == topic]
-        assert sequences == list(range(counts[topic]))
+        assert sequences == list(range(count))
 
 
 def test_images_are_foxgloves(tmp_path):
@@ -123,23 +112,14 @@ def test_what_can_not_be_written_is_left_out(tmp_path):
     recorder.put("/own/topic", 2**70, {"anything": [1, 2]})
     recorder.close()
     assert (recorder.written, recorder.dropped, recorder.failed) == (2, 5, None)
+    recorder.close()
+    put_inputs(recorder, 1)
+    assert recorder.dropped == 6  # after its end
     log = read_drive(tmp_path / "drive.mcap")
+    assert not log.truncated
     assert len(log.inputs) == 1
     assert same_input(log.inputs[0], make_input(2))
     assert log.missing == {"/tick": 1}
-
-
-def test_closing_twice_and_recording_after_it(tmp_path):
-    recorder = Recorder(tmp_path / "drive.mcap", {})
-    put_inputs(recorder, 0)
-    recorder.close()
-    size = (tmp_path / "drive.mcap").stat().st_size
-    recorder.close()
-    put_inputs(recorder, 1)
-    recorder.image("/camera/front", 1, make_picture(1))
-    assert (recorder.written, recorder.dropped, recorder.failed) == (1, 2, None)
-    assert (tmp_path / "drive.mcap").stat().st_size == size
-    assert not read_drive(tmp_path / "drive.mcap").truncated
 
 
 @pytest.mark.parametrize(
@@ -152,9 +132,11 @@ def test_closing_twice_and_recording_after_it(tmp_path):
 )
 def test_a_file_that_can_not_be_made_is_named(tmp_path, name, problem):
     (tmp_path / "folder").mkdir()
-    with pytest.raises(BadInput, match=f"can't be written: {problem}") as error:
+    with pytest.raises(BadInput, match=f"^{tmp_path}/.*: can't be written: {problem}"):
         Recorder(tmp_path / name, {})
-    assert str(error.value).startswith(str(tmp_path))
+    with pytest.raises(TypeError):  # a header that is no JSON is the caller's error
+        Recorder(tmp_path / "drive.mcap", {"rig": object()})
+    assert not (tmp_path / "drive.mcap").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
@@ -163,27 +145,23 @@ def test_a_disk_that_is_full_from_the_start_is_named():
         Recorder("/dev/full", {})
 
 
-def test_a_header_that_is_no_json_is_the_callers_error(tmp_path):
-    with pytest.raises(TypeError):
-        Recorder(tmp_path / "drive.mcap", {"rig": object()})
-    assert not (tmp_path / "drive.mcap").exists()
-
-
-def _fill(recorder: Recorder) -> list[int]:
-    """Put outcomes that don't compress until it fails; the inputs that went with them."""
-    for index in range(100_000):
-        recorder.put(*input_message(make_input(3 * index)))
-        message = outcome_message(make_outcome(index), os.urandom(999).hex())
-        recorder.put("/outcome", 1, message)
-        if recorder.failed:
-            return index
-        time.sleep(0.0005)
-    pytest.fail("the disk never was full")
-
-
-def _check_what_is_left(recorder: Recorder, path: Path, problem: str) -> None:
-    put = _fill(recorder)
-    assert recorder.failed == f"{path}: can't be written: {problem}"
+def test_a_file_that_may_not_grow_ends_the_recording_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "drive.mcap"
+    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
+    recorder = Recorder(path, {"rig": "a rig"})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        for index in range(100_000):
+            put_inputs(recorder, 3 * index)
+            digest = os.urandom(999).hex()  # which does not compress
+            recorder.put("/outcome", 1, outcome_message(make_outcome(index)) | {"digest": digest})
+            if recorder.failed:
+                break
+            time.sleep(0.0005)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert recorder.failed == f"{path}: can't be written: file too large"
     dropped = recorder.dropped
     put_inputs(recorder, 0)
     assert recorder.dropped == dropped + 1
@@ -191,48 +169,9 @@ def _check_what_is_left(recorder: Recorder, path: Path, problem: str) -> None:
     log = read_drive(path)
     assert log.truncated
     assert log.header == {"rig": "a rig"}
-    assert 0 < len(log.inputs) <= put + 1
+    assert 0 < len(log.inputs) <= index + 1
     for index, given in enumerate(log.inputs):
         assert same_input(given, make_input(3 * index))
-
-
-def test_a_write_that_fails_ends_the_recording_and_nothing_else(tmp_path, monkeypatch):
-    path, write = tmp_path / "drive.mcap", recorder_module._File.write
-    recorder = Recorder(path, {"rig": "a rig"})
-
-    def full(file, data):
-        if file.tell() + len(data) > 40_000:
-            write(file, data[: 40_000 - file.tell()])
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(file, data)
-
-    monkeypatch.setattr(recorder_module._File, "write", full)
-    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
-    _check_what_is_left(recorder, path, "no space left on device")
-
-
-def test_a_file_that_may_not_grow_ends_the_recording(tmp_path, monkeypatch):
-    path = tmp_path / "drive.mcap"
-    monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
-    recorder = Recorder(path, {"rig": "a rig"})
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        _check_what_is_left(recorder, path, "file too large")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-def test_a_real_disk_that_is_full_ends_the_recording(tmp_path, monkeypatch):
-    command = ["mount", "-t", "tmpfs", "-o", "size=128k", "jaxnav-test", str(tmp_path)]
-    if os.geteuid() or subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("only root may mount a small disk")
-    try:
-        monkeypatch.setattr(recorder_module, "FLUSH_S", 0.01)
-        recorder = Recorder(tmp_path / "drive.mcap", {"rig": "a rig"})
-        _check_what_is_left(recorder, tmp_path / "drive.mcap", "no space left on device")
-    finally:
-        subprocess.run(["umount", str(tmp_path)], check=True)
 
 
 @pytest.fixture
@@ -316,7 +255,7 @@ def test_a_pipe_that_nobody_empties(tmp_path):
 
         def fill():
             digest = os.urandom(10_000).hex()  # which does not compress
-            recorder.put("/outcome", 1, outcome_message(make_outcome(1), digest))
+            recorder.put("/outcome", 1, outcome_message(make_outcome(1)) | {"digest": digest})
             return recorder.dropped
 
         _until(fill)

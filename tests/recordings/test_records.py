@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault, Health, Reject
@@ -61,19 +60,6 @@ def test_what_is_encoded_comes_back(message):
     json.loads(raw, parse_constant=pytest.fail)  # NaN is no JSON
 
 
-@settings(max_examples=60)
-@given(
-    hnp.arrays(st.sampled_from([np.float32, np.float64]), hnp.array_shapes(max_dims=2, max_side=3))
-)
-def test_arrays_come_back_bit_for_bit(array):
-    back = np.array(decode(encode({"a": array}))["a"], array.dtype)
-    numbers = ~np.isnan(array)
-    assert (
-        back[numbers].view(f"i{array.itemsize}") == array[numbers].view(f"i{array.itemsize}")
-    ).all()
-    assert np.isnan(back[~numbers]).all()
-
-
 def test_what_is_not_finite_stands_aside_in_words():
     raw = encode({"x": 1.5, "costs": np.array([2.0, -np.inf]), "inner": [{"nis": math.nan}]})
     assert json.loads(raw) == {
@@ -83,29 +69,17 @@ def test_what_is_not_finite_stands_aside_in_words():
     }
 
 
-@pytest.mark.parametrize("message", [{"not_finite": 1}, {"a": {"not_finite": {}}}])
-def test_the_key_for_it_is_taken(message):
-    with pytest.raises(ValueError, match="not_finite"):
-        encode(message)
-
-
-@pytest.mark.parametrize(
-    "raw",
-    [
-        b"",
-        b"[1]",
-        b"\xff",
-        b'{"a": NaN}',
-        b'{"a": -Infinity}',
-        b'{"not_finite": 1}',
-        b'{"a": 1, "not_finite": {"a": "inf"}}',
-        b'{"a": ' + b"[" * 100_000,
+def test_what_is_no_message_is_refused():
+    for message in ({"not_finite": 1}, {"a": {"not_finite": {}}}):
+        with pytest.raises(ValueError, match="not_finite"):
+            encode(message)
+    for raw in (
+        b"", b"[1]", b"\xff", b'{"a": NaN}', b'{"a": -Infinity}', b'{"not_finite": 1}',
+        b'{"a": 1, "not_finite": {"a": "inf"}}', b'{"a": ' + b"[" * 100_000,
         b'{"a": ' + b"1" * 10_000 + b"}",
-    ],
-)
-def test_what_is_no_message_is_refused(raw):
-    with pytest.raises(ValueError):  # noqa: PT011  (of whatever the parser says)
-        decode(raw)
+    ):  # fmt: skip
+        with pytest.raises(ValueError):  # noqa: PT011  (of whatever the parser says)
+            decode(raw)
 
 
 def _sighted(seed: int) -> FrameDetections:
@@ -155,7 +129,7 @@ def test_an_outcome_is_recorded_whole(dtype):
     outcome = dataclasses.replace(
         make_outcome(3, seed=1, dtype=dtype), outvoted=(7,), outvoted_cameras=("rear",)
     )
-    got = validate(MESSAGES["/outcome"][1], decode(encode(outcome_message(outcome, "d"))), PATH)
+    got = validate(MESSAGES["/outcome"][1], decode(encode(outcome_message(outcome))), PATH)
     assert (got.now_ns, got.stamp_ns) == (outcome.now_ns, outcome.stamp_ns)
     assert (got.health, got.faults, got.rejects) == (
         Health.DEGRADED,
@@ -163,7 +137,7 @@ def test_an_outcome_is_recorded_whole(dtype):
         Reject.TOO_LATE,
     )
     assert (got.steering_rad, got.throttle) == (outcome.steering_rad, outcome.throttle)
-    assert (got.restarts, got.reason, got.digest) == (2, "the loop was away", "d")
+    assert (got.restarts, got.reason, got.digest) == (2, "the loop was away", digest(outcome))
     output, belief = outcome.output, outcome.belief.bank
     np.testing.assert_array_equal(got.pose, output.pose)
     np.testing.assert_array_equal(got.covariance, output.covariance)
@@ -240,80 +214,59 @@ def test_foxglove_understands_the_schemas(model):
     check(json.loads(json_schema(model)))
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({"pose": [1.0, 2.0]}, "/outcome.pose: must hold 3 values"),
-        ({"pose": ["1", "2", "3"]}, r"/outcome.pose\[0\]: must be a number, got the text '1'"),
-        ({"hypotheses": [1.0] * 4}, "/outcome.hypotheses: must hold 3 values a row"),
-        ({"covariance": [1.0] * 5}, "/outcome.covariance: must be a square matrix"),
-        ({"health": "FINE"}, "/outcome.health: unknown word 'FINE'"),
-        ({"health": {}}, "/outcome.health: unknown word '{}'"),
-        ({"faults": [[]]}, r"/outcome.faults: unknown word '\[\]'"),
-        ({"faults": "NO_MARKER"}, "/outcome.faults: must be a list"),
-        ({"now_ns": 1.0}, "/outcome.now_ns: must be a whole number"),
-        ({"now_ns": 2**63}, "/outcome.now_ns: must be < "),
-        ({"nis": None}, "/outcome: must have all of pose"),
-        ({"other": 1}, "/outcome.other: unknown key"),
-    ],
-)
-def test_a_wrong_outcome_is_named(change, problem):
+def test_a_wrong_outcome_is_named():
     message = json.loads(encode(outcome_message(make_outcome(1))))
     del message["not_finite"]
     message["costs"] = [1.0]
     validate(MESSAGES["/outcome"][1], message, PATH, "/outcome")
-    with pytest.raises(BadInput, match=problem) as error:
-        validate(MESSAGES["/outcome"][1], message | change, PATH, "/outcome")
-    assert str(error.value).startswith("drive.mcap: /outcome")
+    for change, problem in [
+        ({"pose": [1.0, 2.0]}, ".pose: must hold 3 values"),
+        ({"pose": ["1", "2", "3"]}, r".pose\[0\]: must be a number, got the text '1'"),
+        ({"hypotheses": [1.0] * 4}, ".hypotheses: must hold 3 values a row"),
+        ({"covariance": [1.0] * 5}, ".covariance: must be a square matrix"),
+        ({"health": "FINE"}, ".health: unknown word 'FINE'"),
+        ({"health": {}}, ".health: unknown word '{}'"),
+        ({"faults": [[]]}, r".faults: unknown word '\[\]'"),
+        ({"faults": "NO_MARKER"}, ".faults: must be a list"),
+        ({"now_ns": 1.0}, ".now_ns: must be a whole number"),
+        ({"now_ns": 2**63}, ".now_ns: must be < "),
+        ({"nis": None}, ": must have all of pose"),
+        ({"other": 1}, ".other: unknown key"),
+    ]:
+        with pytest.raises(BadInput, match=f"^drive.mcap: /outcome{problem}"):
+            validate(MESSAGES["/outcome"][1], message | change, PATH, "/outcome")
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({"ids": [1]}, "must agree in number"),
-        ({"families": ["a"]}, "must agree in number"),
-        ({"ids": [1], "families": ["a"], "refined": [True]}, "must agree"),
-        ({"refined": [1]}, r"refined\[0\]: must be true or false, got 1"),
-        ({"ids": [1.5]}, r"ids\[0\]: must be a whole number, got 1.5"),
-        ({"camera": -1}, "must be >= 0"),
-    ],
-)
-def test_a_wrong_frame_is_named(change, problem):
+def test_a_wrong_frame_is_named():
     empty = Input(1, frames=(FrameDetections(0, 1, Detections.concatenate([])),))
-    message = json.loads(encode(input_message(empty)[2]))
-    message["frames"][0] |= change
-    with pytest.raises(BadInput, match=problem):
-        validate(MESSAGES["/frames"][1], message, PATH, "/frames")
+    for of, change, problem in [
+        (empty, {"ids": [1]}, "must agree in number"),
+        (empty, {"families": ["a"]}, "must agree in number"),
+        (empty, {"ids": [1], "families": ["a"], "refined": [True]}, "must agree"),
+        (empty, {"refined": [1]}, r"refined\[0\]: must be true or false, got 1"),
+        (empty, {"ids": [1.5]}, r"ids\[0\]: must be a whole number, got 1.5"),
+        (empty, {"camera": -1}, "must be >= 0"),
+        (make_input(1), {"usable": False}, "has no detections"),
+    ]:
+        message = json.loads(encode(input_message(of)[2]))
+        message["frames"][0] |= change
+        with pytest.raises(BadInput, match=problem):
+            validate(MESSAGES["/frames"][1], message, PATH, "/frames")
 
 
-def test_detections_of_an_unusable_frame_are_refused():
-    seen = input_message(make_input(1))[2]
-    message = json.loads(encode(seen))
-    assert message["frames"][0]["ids"]
-    message["frames"][0]["usable"] = False
-    with pytest.raises(BadInput, match="has no detections"):
-        validate(MESSAGES["/frames"][1], message, PATH, "/frames")
-
-
-def test_the_header_comes_back():
+def test_the_header_comes_back_or_is_named():
     header = {"rig": "cameras: ...", "route": np.array([[1.3, 0.0], [0.5, np.nan]]), "n": {"a": 1}}
     back = header_of(header_metadata(header), PATH)
     assert back["rig"] == header["rig"]
     np.testing.assert_array_equal(back["route"], header["route"])
     assert back["n"] == {"a": 1}
-
-
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        ({"format_version": "2"}, "drive.mcap: format_version: this program reads format 1, the"),
-        ({"format_version": "one"}, "drive.mcap: format_version: must be a whole number"),
-        ({"format_version": "\u0663"}, "must be a whole number"),
-        ({"header": "{}"}, "drive.mcap: header: is damaged"),
-        ({"header": "[]", "crc32": "b7061ebe"}, "drive.mcap: header: is damaged"),
-        ({"crc32": ""}, "drive.mcap: header: is damaged"),
-    ],
-)
-def test_a_wrong_header_is_named(change, problem):
-    with pytest.raises(BadInput, match=problem):
-        header_of(header_metadata({"a": 1}) | change, PATH)
+    for change, problem in [
+        ({"format_version": "2"}, "format_version: this program reads format 1, the file has 2"),
+        ({"format_version": "one"}, "format_version: must be a whole number"),
+        ({"format_version": "\u0663"}, "format_version: must be a whole number"),
+        ({"header": "{}"}, "header: is damaged"),
+        ({"header": "[]", "crc32": "b7061ebe"}, "header: is damaged"),
+        ({"crc32": ""}, "header: is damaged"),
+    ]:
+        with pytest.raises(BadInput, match=f"^drive.mcap: {problem}"):
+            header_of(header_metadata({"a": 1}) | change, PATH)

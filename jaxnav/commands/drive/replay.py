@@ -16,9 +16,9 @@ from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import apply_params, output_folder, write_tum
-from jaxnav.recordings.other.odometry_delay import odometry_delay
 from jaxnav.recordings.other.recordings import Recording, read_recording
 from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
+from jaxnav.recordings.ros.odometry_track import odometry_delay
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

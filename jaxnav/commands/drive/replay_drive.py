@@ -35,8 +35,8 @@ from jaxnav.recordings.drive_replay import (
     replay_drive,
 )
 from jaxnav.recordings.drive_setup import DriveSetup, needs_float64
+from jaxnav.recordings.other.localise import DriveTrack, distances, smooth_drive
 from jaxnav.recordings.other.ros import read_ros_drive
-from jaxnav.recordings.other.smoothed_drive import DriveTrack, distances, smooth_drive
 from jaxnav.recordings.plausible import keep_plausible
 from jaxnav.recordings.recorder import Recorder
 from jaxnav.recordings.records import Outcomes

@@ -23,7 +23,7 @@ from jaxnav.errors import EXIT_INTERRUPTED, BadInput, visible
 from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of, fit_of, take_step
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import write_params
-from jaxnav.files.npz import read_npz
+from jaxnav.files.unpacking import read_npz
 from jaxnav.files.writing import atomic_write, plain_data, sole_writer
 
 if TYPE_CHECKING:

@@ -136,6 +136,7 @@ def _read(
     choose: Choose,
     take: Callable[[ReceivedMessage], object],
 ) -> None:
+    taken = ""  # the topic of the message that is taken
     try:
         _unpacking.budget, _unpacking.kept = _budget(plain), {}
         with reader_class(plain) as reader:
@@ -156,31 +157,22 @@ def _read(
                     raise ValueError(f"a message of {topic} has no time")
                 if problem := problem_of("stamp_ns", received_ns):
                     raise ValueError(f"the time of a message of {topic} {problem}")
-                _take(path, take, ReceivedMessage(topic, kind, received_ns, message))
+                taken = topic
+                take(ReceivedMessage(topic, kind, received_ns, message))
+                taken = ""
     except BadInput:
         raise
     except Exception as error:
-        # The reader may meet any bytes, and raises whatever they lead to.
-        raise BadInput(path, f"is not a readable ROS bag ({_one_line(error)})") from None
+        # The reader may meet any bytes, and raises whatever they lead to. A definition in the bag
+        # may differ from the one that its name promises.
+        problem = (
+            f"{taken}: a message can't be understood" if taken else "is not a readable ROS bag"
+        )
+        text = " ".join(str(error).split())
+        text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+        raise BadInput(path, f"{problem} ({type(error).__name__}: {text})") from None
     finally:
         _unpacking.budget = _unpacking.kept = None
-
-
-def _take(path: Path, take: Callable[[ReceivedMessage], object], received: ReceivedMessage) -> None:
-    try:
-        take(received)
-    except BadInput:
-        raise
-    except Exception as error:
-        # A definition in the bag may differ from the one that its name promises.
-        problem = f"{received.topic}: a message can't be understood ({_one_line(error)})"
-        raise BadInput(path, problem) from None
-
-
-def _one_line(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-    return f"{type(error).__name__}: {text}"
 
 
 # --- definitions ---

@@ -12,9 +12,9 @@ from jaxnav.core.models.rig import PLACED_BY_CALIBRATION, CameraRig
 from jaxnav.errors import BadInput
 from jaxnav.files import poses
 from jaxnav.files.markers import marker_map
-from jaxnav.files.npz import read_npz
 from jaxnav.files.ranges import is_within, pinhole_problem, problem_of
 from jaxnav.files.rigs import CameraEntry, CameraSigma, coefficients_problem, pose_entry, rig_of
+from jaxnav.files.unpacking import read_npz
 from jaxnav.recordings.other.recording import TO_OURS, Rows, Source
 
 # key -> shape, whose letters are sizes that must agree; kind (i: whole numbers, f: numbers, U:

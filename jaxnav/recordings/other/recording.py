@@ -130,6 +130,21 @@ class Rows:
     frame_stamps_ns: Int[np.ndarray, " F"]  # of all frames, those without a detection as well
     families: tuple[str, ...] | None = None  # (N,); None where the recording does not tell
 
+    def reliable(self, *markers: np.ndarray) -> Int[np.ndarray, " K"]:
+        """The rows to use, by stamp, camera and marker: corners that are nowhere are left out, and
+        a marker that a camera reports twice in one frame.
+
+        Args:
+            markers: (N,) numbers or texts by which rows of one marker are known.
+        """
+        keys = self.stamps_ns, self.cameras, *markers
+        order = np.lexsort(keys[::-1])
+        same = np.stack([key[order[1:]] == key[order[:-1]] for key in keys]).all(axis=0)
+        twice = (np.append(same, False) | np.insert(same, 0, False))[: len(order)]
+        somewhere = np.asarray(is_within("corner_px", self.corners_px).all(axis=(1, 2)))
+        kept: np.ndarray = order[~twice & somewhere[order]]
+        return kept
+
 
 def rows_of(
     frames: Sequence[tuple[int, int, Detections]],
@@ -197,21 +212,13 @@ def assemble(path: Path, source: Source, markers: MarkerMap | None = None) -> Re
     index_of_id = {marker_id: index for index, marker_id in enumerate(markers.ids)}
     index = np.array([index_of_id.get(int(marker_id), -1) for marker_id in rows.ids], int)
     mapped = index >= 0
-    finite = is_within("corner_px", rows.corners_px).all(axis=(1, 2))
-    frame = np.searchsorted(stamps, rows.stamps_ns)
-
-    used = np.flatnonzero(mapped & finite)
-    shape = (len(stamps), len(rig), len(markers.ids))
-    at = np.ravel_multi_index((frame[mapped], rows.cameras[mapped], index[mapped]), shape)
-    once = np.ones(len(rows.ids), bool)
-    _, which, reports = np.unique(at, return_inverse=True, return_counts=True)
-    once[mapped] = reports[which] == 1
-    used = used[once[used]]
-    used = used[np.lexsort((index[used], rows.cameras[used], frame[used]))]
+    used = rows.reliable(index)
+    used = used[mapped[used]]
+    frame = np.searchsorted(stamps, rows.stamps_ns[used])
     return Recording(
         name=source.name,
         stamps_ns=stamps,
-        seen_at=np.stack([frame[used], rows.cameras[used], index[used]]),
+        seen_at=np.stack([frame, rows.cameras[used], index[used]]),
         seen_px=rows.corners_px[used],
         rig=rig,
         markers=markers,

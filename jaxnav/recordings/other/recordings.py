@@ -11,7 +11,6 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.errors import BadInput
-from jaxnav.files.ranges import is_within
 from jaxnav.files.topics import TopicMap
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_replay import check_inputs
@@ -115,8 +114,6 @@ class RecordedSightings:
 def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSightings:
     """Read a drive (.mcap), a TagSLAM folder, a .bag of detections or an .npz.
 
-    A marker that a camera reports twice in a frame is left out there: one of the two is false.
-
     Args:
         rig: replaces the recording's own.
 
@@ -127,18 +124,14 @@ def read_sightings(path: str | Path, rig: CameraRig | None = None) -> RecordedSi
     source = open_recording(path, rig, drives=True)
     rows = source.rows
     check_winding(path, rows.corners_px)
-    stamps_ns, frame = np.unique(rows.stamps_ns, return_inverse=True)
     named = np.array(rows.families if rows.families is not None else [""] * len(rows.ids), str)
-    keys = np.rec.fromarrays([frame, rows.cameras, rows.ids, named])
-    _, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
-    once = (count[inverse] == 1) & is_within("corner_px", rows.corners_px).all(axis=(1, 2))
-    kept = np.flatnonzero(once)
-    kept = kept[np.lexsort([rows.ids[kept], rows.cameras[kept], frame[kept]])]
+    kept = rows.reliable(rows.ids, named)
+    stamps_ns = np.unique(rows.stamps_ns)
     return RecordedSightings(
         source.rig,
         source.markers() if path.suffix == ".mcap" else None,
         stamps_ns,
-        frame[kept],
+        np.searchsorted(stamps_ns, rows.stamps_ns[kept]),
         rows.cameras[kept],
         rows.ids[kept],
         rows.corners_px[kept],

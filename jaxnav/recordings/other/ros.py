@@ -126,25 +126,18 @@ def join_frames(frames: Iterable[tuple[int, FrameDetections]]) -> list[Input]:
     ]
 
 
-def read_ros_rig(
-    path: Path,
-    topics: TopicMap,
-    rig: CameraRig,
-    markers: MarkerMap,
-    corner_backend: str = "aruco",
-) -> Source:
+def read_ros_rig(path: Path, topics: TopicMap, rig: CameraRig, markers: MarkerMap) -> Source:
     """Read all frames of a bag, and its IMU where the topic map has one.
 
     Args:
         path: as in `read_ros_drive`.
         topics: the topics to read; its odometry is not looked at.
-        corner_backend: see `make_detector`; for images.
 
     Raises:
         BadInput: one line naming the file and the topic or key.
     """
     imu, read = topics.imu, topics.model_copy(update={"odometry": None})
-    camera_reader = _CameraReader(path, read, rig, markers, corner_backend)
+    camera_reader = _CameraReader(path, read, rig, markers, "aruco")
     frames: list[tuple[int, int, Detections]] = []
     frame_stamps_ns: list[int] = []
     samples: dict[int, tuple[float, ...]] = {}  # by stamp, turn rate and specific force

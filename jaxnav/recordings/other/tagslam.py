@@ -29,16 +29,7 @@ from jaxnav.files.ranges import is_within, within
 from jaxnav.files.reading import read_mapping
 from jaxnav.files.rigs import pose_entry, rig_of
 from jaxnav.files.topics import OdometrySigma
-from jaxnav.files.validation import (
-    Count,
-    ForeignEntry,
-    Number,
-    Size,
-    Text,
-    Vector,
-    at,
-    validate,
-)
+from jaxnav.files.validation import Count, ForeignEntry, Number, Size, Text, Vector, at, validate
 from jaxnav.recordings.other.bags import ReceivedMessage, is_ros1_bag, read_messages
 from jaxnav.recordings.other.recording import Rows, Source, rows_of
 from jaxnav.recordings.ros.camera_messages import TAGSLAM, detections
@@ -188,6 +179,10 @@ class TagSlamFile(ForeignEntry):
     default_body: str | None = None
     bodies: Annotated[list[dict[str, _BodyEntry]], Field(min_length=1)]
 
+    def by_name(self) -> dict[str, _BodyEntry]:
+        """The bodies by their names."""
+        return {name: entry for body in self.bodies for name, entry in body.items()}
+
 
 class _CameraPoseEntry(ForeignEntry):
     pose: _PoseEntry
@@ -206,7 +201,9 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> Source:
         raise BadInput(path, "holds no .bag and no .bag.bz2")
     chain = kalibr.camchain(path / "cameras.yaml")
     body = next(iter(chain.values())).rig_body or "rig"
-    moves = _body(path, body)
+    file = path / "tagslam.yaml"
+    settings = validate(TagSlamFile, read_mapping(file), file) if file.exists() else None
+    moves = None if settings is None else settings.by_name().get(body)
     recorded = [_read_bag(file, None if moves is None else moves.odom_topic) for file in files]
     cameras = []
     for key, entry in chain.items():
@@ -224,18 +221,14 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> Source:
         path.name,
         _rows(cameras),
         rig,
-        lambda: _markers(path, edges),
+        lambda: _markers(file, settings, edges),
         lambda: _reference(edges, body),
-        None if moves is None else _odometry(path, body, moves, recorded),
+        None if moves is None else _odometry(file, body, moves, recorded),
     )
 
 
 def _only(
-    by_topic: Sequence[dict[str, Any]],
-    topic: str,
-    kind: str,
-    where: str,
-    recorded: Sequence[_Bag],
+    by_topic: Sequence[dict[str, Any]], topic: str, kind: str, where: str, recorded: Sequence[_Bag]
 ) -> Any:
     """What the one bag that has a topic holds of it."""
     found = [held[topic] for held in by_topic if topic in held]
@@ -254,21 +247,12 @@ def _reference(edges: _Edges, body: str) -> _Poses | None:
     return reference or None
 
 
-def _body(path: Path, body: str) -> _BodyEntry | None:
-    """The entry of the rig in tagslam.yaml; None without one."""
-    file = path / "tagslam.yaml"
-    if not file.exists():
-        return None
-    return _by_name(validate(TagSlamFile, read_mapping(file), file)).get(body)
-
-
 def _odometry(
-    path: Path, body: str, entry: _BodyEntry, recorded: Sequence[_Bag]
+    file: Path, body: str, entry: _BodyEntry, recorded: Sequence[_Bag]
 ) -> OdometryTrack | None:
     """The track of the rig's `odom_topic`; None where its entry names none."""
     if entry.odom_topic is None:
         return None
-    file = path / "tagslam.yaml"
     where = at(file, f"bodies.{body}")
     if entry.T_body_odom is None:
         raise BadInput(f"{where}.T_body_odom", f"missing: where is the body of {entry.odom_topic}?")
@@ -280,10 +264,6 @@ def _odometry(
         np.array(stamps, np.int64), poses_read, entry.T_body_odom.pose(), entry.odom_sigma.sigma()
     )
     return whole.earlier_by(entry.odom_delay_s)
-
-
-def _by_name(settings: TagSlamFile) -> dict[str, _BodyEntry]:
-    return {name: entry for body in settings.bodies for name, entry in body.items()}
 
 
 def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: _Edges, body: str) -> CameraRig:
@@ -302,11 +282,10 @@ def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: _Edges, body:
     return rig_of(cameras)
 
 
-def _markers(path: Path, edges: _Edges) -> MarkerMap:
+def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges) -> MarkerMap:
     """The map: poses from /tf, or else known ones of tagslam.yaml; sizes from tagslam.yaml."""
-    file = path / "tagslam.yaml"
-    settings = validate(TagSlamFile, read_mapping(file), file)
-    bodies = _by_name(settings)
+    settings = settings or validate(TagSlamFile, read_mapping(file), file)  # it is not there
+    bodies = settings.by_name()
     entry_of = {(name, tag.id): tag for name, body in bodies.items() for tag in body.tags}
     Ts_world_marker: dict[int, tuple[str, np.ndarray]] = {}
     parents = {child: (parent, stamped) for (parent, child), stamped in edges.items()}

@@ -44,11 +44,7 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 
 def detections(
-    kind: str,
-    message: Any,
-    first_corner: FirstCorner,
-    sigma_px: float,
-    families: Mapping[int, str],
+    kind: str, message: Any, first_corner: FirstCorner, sigma_px: float, families: Mapping[int, str]
 ) -> Detections:
     """The markers in a message of `APRILTAG_ROS` or `TAGSLAM`.
 

@@ -12,6 +12,7 @@ from jaxnav.core.filter.planar import planar_poses
 from jaxnav.core.models.origin import Origin, poses_in_world
 from jaxnav.drive.pilot import Outcome
 from jaxnav.files.poses import compose, matrix
+from jaxnav.recordings.learnt import heaviest_slot
 
 PLANAR = np.array([0, 1, 5])  # x, y and the rotation about z among the six
 _FLOOR_VARIANCE = 1e-6  # of z, roll and pitch of a car on its floor, (1 mm)^2 and (1 mrad)^2
@@ -43,7 +44,7 @@ def base_twist(
     """The twist (6,) of the base in its own axes, m/s and rad/s, and its covariance."""
     bank, output = outcome.belief.bank, outcome.output
     if moves_freely(bank):
-        twist = np.asarray(bank.mean, float)[_heaviest(bank), 7:13]
+        twist = np.asarray(bank.mean, float)[heaviest_slot(bank), 7:13]
         covariance = np.asarray(output.covariance, float)[6:12, 6:12]
     else:
         turn = matrix(np.asarray(outcome.T_world_vehicle, float))[:3, :3].T
@@ -81,10 +82,6 @@ def base_hypotheses(
 def moves_freely(bank: Bank) -> bool:
     """Whether it is of a body free in six directions: a quaternion has a number more."""
     return bank.mean.shape[1] > bank.covariance.shape[1]
-
-
-def _heaviest(bank: Bank) -> int:
-    return int(np.argmax(np.where(bank.initialised, bank.log_weight, -np.inf)))
 
 
 def _vehicle_pose(bank: Bank, row: int, origin_m: Origin) -> tuple[np.ndarray, np.ndarray]:

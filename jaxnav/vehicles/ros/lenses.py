@@ -81,7 +81,7 @@ def read_lens(topic: str, message: Any, rectified: bool) -> CameraEntry:
         "distortion_model": model,
         "distortion_coefficients": {"rows": 1, "cols": len(coefficients), "data": coefficients},
     }
-    return validate(CameraInfo, data, Path(topic)).camera(Path(topic), topic)
+    return validate(CameraInfo, data, Path(topic)).camera(topic)
 
 
 def with_lenses(rig: CameraRig, lenses: Mapping[str, CameraEntry]) -> CameraRig:

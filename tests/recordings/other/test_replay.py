@@ -16,11 +16,10 @@ from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.files import write_params
-from jaxnav.recordings.other import replay as replays
-from jaxnav.recordings.other import smoothed
+from jaxnav.recordings.other import localise
+from jaxnav.recordings.other.localise import CHUNK_FRAMES, filter_frames, smooth_frames
 from jaxnav.recordings.other.recordings import Recording, read_recording
-from jaxnav.recordings.other.replay import CHUNK_FRAMES, Replay, errors, frames_in_view, replay
-from jaxnav.recordings.other.smoothed import smooth_frames
+from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, replay
 from jaxnav.recordings.ros.odometry_track import OdometryTrack
 from tests.helpers.compiling import jit_to_run
 
@@ -45,9 +44,9 @@ def keep_the_compile_cache(monkeypatch):
 @pytest.fixture
 def run_banks_fast(monkeypatch):
     """A bank takes longer over a whole recording than to be optimised."""
-    chunk = jit_to_run(replays._run_chunk.__wrapped__, static_argnums=(3, 4))
-    monkeypatch.setattr(replays, "_run_chunk", chunk)
-    monkeypatch.setattr(smoothed, "smooth_frames", jit_to_run(smooth_frames.__wrapped__))
+    fast = jit_to_run(filter_frames.__wrapped__, static_argnums=(3, 4))
+    monkeypatch.setattr(localise, "filter_frames", fast)
+    monkeypatch.setattr(localise, "smooth_frames", jit_to_run(smooth_frames.__wrapped__))
 
 
 @pytest.mark.parametrize(
@@ -246,29 +245,20 @@ def test_parameters_go_before_what_the_recording_tells(test_7, tmp_path, monkeyp
     assert np.abs(tracks[0][-1, 1:4] - own.T_world_vehicle[-1, 0, 4:]).max() > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["missing"], "missing: there is no such file or folder"),
-        (["{tmp}"], "no"),
-        (["{tmp}/x.txt"], "is no recording"),
-        (["{data}/test_7/tag_detections.bag.bz2"], "--rig: missing"),
-        (["{data}/test_7", "--rig", "nowhere.yaml"], "nowhere.yaml"),
-        (["{data}/test_7", "--params", "nowhere.yaml"], "nowhere.yaml"),
-        (["{data}/test_7", "--params", "{tmp}/p.yaml"], "odometry_sigma: this navigator has no su"),
-        (["{data}/test_7", "--limit", "0"], "--limit: must be at least 1, got 0"),
-        (["{data}/test_7", "--selector", "none"], "--selector"),
-        (["{data}/test_7", "--out", "{tmp}/x.txt"], "is a file, not a folder"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(data_dir, tmp_path, capsys, args, message):
+def test_bad_input_is_one_line_and_exit_code_2(data_dir, tmp_path, capsys):
     (tmp_path / "x.txt").write_text("no recording")
     write_params(tmp_path / "p.yaml", {"motion.odometry_sigma": [1.0] * 3})  # of a car
-    places = {"tmp": tmp_path, "data": data_dir / "tagslam"}
-    out = [] if "--out" in args else ["--out", str(tmp_path / "out")]
-    code = main(["replay", *(arg.format(**places) for arg in args), *out])
-    error = capsys.readouterr().err
-    assert code == 2
-    assert len(error.strip().splitlines()) == 1
-    assert message in error
+    folder = data_dir / "tagslam" / "test_7"
+    for args, message in [
+        (["missing"], "missing: there is no such file or folder"),
+        ([tmp_path / "x.txt"], "is no recording"),
+        ([folder / "tag_detections.bag.bz2"], "--rig: missing"),
+        ([folder, "--rig", "nowhere.yaml"], "nowhere.yaml"),
+        ([folder, "--params", tmp_path / "p.yaml"], "odometry_sigma: this navigator has no such n"),
+        ([folder, "--limit", "0"], "--limit: must be at least 1, got 0"),
+        ([folder, "--selector", "none"], "--selector"),
+    ]:
+        assert main(["replay", *map(str, args), "--out", str(tmp_path / "out")]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert message in line
     assert not (tmp_path / "out").exists()

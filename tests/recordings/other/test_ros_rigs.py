@@ -14,11 +14,11 @@ from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.imu import InertialMotion
 from jaxnav.core.models.conventions import APRILTAG_PIXEL_EDGE_PX, TL_TR_BR_BL
 from jaxnav.core.models.imu import CONSUMER, TACTICAL
-from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 from jaxnav.recordings.other.recordings import read_recording
 from jaxnav.recordings.other.replay import motion_of, replay
 from jaxnav.sim.hand_held import HandHeld, imu_samples, observe
+from tests.helpers.bad_input import problem
 from tests.helpers.ros_bags import FORMATS, Bag
 from tests.helpers.ros_drives import BEGIN_NS, MS, SQUARE_PX, topic_map
 from tests.worlds import qcar_rig, room_markers
@@ -109,44 +109,19 @@ def test_kalibr_s_figures_go_by_name(tmp_path):
     np.testing.assert_allclose(entry.T_matrix(), recording.imu.T_vehicle_imu, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("imu", "message"),
-    [
-        ("{topic: /imu}", "topics.yaml: imu.T_vehicle_imu: missing"),
-        (f"{{T_vehicle_imu: {PLACE}}}", "topics.yaml: imu: give one of topic and rostopic"),
-        (f"{{topic: /i, rostopic: /i, T_vehicle_imu: {PLACE}}}", "imu: give one of topic and ro"),
-        (f"{{topic: /i, T_vehicle_imu: {PLACE}, preset: good}}", "imu.preset: must be 'consumer'"),
-        (f"{{topic: /i, T_vehicle_imu: {PLACE}, imu_delay_s: 3}}", "imu.imu_delay_s: must be from"),
-        (f"{{topic: /i, T_vehicle_imu: {PLACE}, noise: 3}}", "imu.noise: unknown key"),
-        (
-            f"{{topic: /i, T_vehicle_imu: {PLACE}, gyroscope_noise_density: -1}}",
-            "imu.gyroscope_noise_density: must be > 0, got -1",
-        ),
-    ],
-)
-def test_a_bad_entry_is_named_with_its_key(tmp_path, imu, message):
-    with pytest.raises(BadInput) as caught:
-        topic_map(tmp_path, f"cameras: {{front: /a}}\nimu: {imu}\n")
-    assert message in str(caught.value)
-
-
-def test_topics_that_do_not_fit_are_one_line(tmp_path):
+def test_an_imu_that_is_none_or_says_nothing_is_one_line(tmp_path):
     path = small_bag("mcap").write(tmp_path)
-    for topic, message in (
-        ("/gyro", f"topics.yaml: imu: {path} has no topic /gyro; topics found: /front/detections"),
-        ("/odom", f"imu: /odom of {path} is of nav_msgs/msg/Odometry, not of sensor_msgs/msg/Imu"),
-    ):
-        topics = topic_map(tmp_path, TOPICS.replace("topic: /imu", f"topic: {topic}"))
-        with pytest.raises(BadInput) as caught:
-            read_recording(path, qcar_rig(), room_markers(), topics)
-        assert message in str(caught.value)
-    bag = Bag("mcap")
-    bag.apriltags("/front/detections", BEGIN_NS, BEGIN_NS, [])
-    bag.imu("/imu", BEGIN_NS, BEGIN_NS, np.zeros(3), np.zeros(3))
+    short = Bag("mcap")
+    short.apriltags("/front/detections", BEGIN_NS, BEGIN_NS, [])
+    short.imu("/imu", BEGIN_NS, BEGIN_NS, np.zeros(3), np.zeros(3))
     (tmp_path / "short").mkdir()
-    topics = topic_map(tmp_path, TOPICS.replace(", left: /left/tags", ""))
-    with pytest.raises(BadInput, match="has 1 samples: 2 are needed"):
-        read_recording(bag.write(tmp_path / "short"), qcar_rig(), room_markers(), topics)
+    for bag, old, new, message in (
+        (path, "topic: /imu", "topic: /gyro", f"imu: {path} has no topic /gyro; topics found: "),
+        (path, "topic: /imu", "topic: /odom", f"imu: /odom of {path} is of nav_msgs/msg/Odometry,"),
+        (short.write(tmp_path / "short"), ", left: /left/tags", "", "1 samples: 2 are needed"),
+    ):
+        topics = topic_map(tmp_path, TOPICS.replace(old, new))
+        assert message in problem(read_recording, bag, qcar_rig(), room_markers(), topics)
 
 
 @pytest.fixture(scope="module")

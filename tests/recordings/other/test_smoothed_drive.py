@@ -5,7 +5,7 @@ import pytest
 
 from jaxnav.cli import main
 from jaxnav.recordings.drive_events import DriveEvents
-from jaxnav.recordings.other.smoothed_drive import DriveTrack, smooth_drive
+from jaxnav.recordings.other.localise import DriveTrack, smooth_drive
 from jaxnav.vehicles.conformance.lockstep import Rates, Step
 from tests.helpers.simulated import make_setup, simulated
 from tests.recordings.test_regression import FOLDER

@@ -61,23 +61,16 @@ def test_the_covariance_of_the_base_is_that_of_moved_samples(steps):
 
 
 def test_the_hypotheses_come_heaviest_first_and_weigh_one(steps):
-    undecided = next(step.outcome for step in steps if len(_alive(step)) > 1)
+    alive = [int(step.outcome.belief.bank.initialised.sum()) for step in steps]
+    first = next(index for index, count in enumerate(alive) if count > 1)
+    undecided = steps[first].outcome
     poses, _, weight = base_hypotheses(undecided, 0.0)
-    assert len(weight) == len(_alive_of(undecided))
+    assert len(weight) == alive[first]
     assert np.all(np.diff(weight) <= 0)
     assert np.sum(weight) == pytest.approx(1)
     # They are those of the last data, the pose is the present one: the car drives 0.5 m/s.
     np.testing.assert_allclose(poses[0, 4:6], undecided.pose[:2], atol=0.01)
-    if not _alive(steps[0]):
-        assert len(base_hypotheses(steps[0].outcome, 0.0)[2]) == 0
-
-
-def _alive(step: Step) -> list[int]:
-    return _alive_of(step.outcome)
-
-
-def _alive_of(outcome) -> list[int]:
-    return np.flatnonzero(outcome.belief.bank.initialised).tolist()
+    assert len(base_hypotheses(steps[0].outcome, 0.0)[2]) == alive[0]
 
 
 def test_a_free_body_s_covariance_is_in_the_axes_of_the_map():

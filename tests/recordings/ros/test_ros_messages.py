@@ -127,23 +127,6 @@ def test_any_float_in_a_pose_that_goes_on_stays_finite(data):
             assert pose is None or np.isfinite(pose).all()
 
 
-def test_odometry_at_its_limits(tmp_path):
-    bag = Bag("bag")
-    bag.apriltags("/front", BEGIN_NS, BEGIN_NS, [])
-    readings = [(0.0, 5.0), (-0.4, -0.2), (0.01, 3.0), (0.1, 9.0), (0.5, math.nan), (math.inf, 1.0)]
-    for k, (forward_mps, yaw_rate) in enumerate(readings, 1):
-        bag.odometry("/odom", BEGIN_NS + k, BEGIN_NS + k, forward_mps, yaw_rate)
-    topics = topic_map(tmp_path, "cameras: {front: /front}\nodometry: /odom\n")
-    read_back = [g.odometry for g in read(bag.write(tmp_path), topics)[1:]]
-    backwards = math.atan(0.2 * float(qcar().wheelbase_m) / 0.4)
-    limit = float(qcar().steering_limit_rad)
-    steering = [0.0, backwards, backwards, limit, math.nan, math.nan]
-    np.testing.assert_array_equal([reading.steering_rad for reading in read_back], steering)
-    forward = np.array([0.0, -0.4, 0.01, 0.1, math.nan, math.nan])
-    speeds = forward / np.cos(np.arctan(np.tan(steering) / 2))
-    np.testing.assert_allclose([reading.speed_mps for reading in read_back], speeds, atol=1e-15)
-
-
 # --- which corner comes first ---------------------------------------------------------------------
 
 
@@ -209,27 +192,21 @@ def test_images_are_searched(tmp_path, picture):
     assert "the encoding 'mono16' is none of mono8" in problem(sixteen.write(tmp_path), topics)
 
 
-@pytest.mark.parametrize(
-    ("encoding", "weights"),
-    [("rgb8", (0, 1, 2)), ("bgr8", (2, 1, 0)), ("rgba8", (0, 1, 2)), ("bgra8", (2, 1, 0))],
-)
-def test_colours_are_weighed_as_they_are_seen(encoding, weights):
-    channels = 4 if "a" in encoding else 3
-    pixels = np.zeros((2, 3, channels), np.uint8)
-    pixels[..., weights[0]] = 200  # red
-    message = Bag("mcap")
-    message.image("/a", 1, pixels, encoding)
-    image = grey_image(IMAGE, message.rows[0][3])
-    np.testing.assert_array_equal(image, np.full((2, 3), round(0.299 * 200)))
+def test_colours_are_weighed_as_they_are_seen():
+    for encoding, red in (("rgb8", 0), ("bgr8", 2), ("rgba8", 0), ("bgra8", 2)):
+        pixels = np.zeros((2, 3, 4 if "a" in encoding else 3), np.uint8)
+        pixels[..., red] = 200
+        bag = Bag("mcap")
+        bag.image("/a", 1, pixels, encoding)
+        image = grey_image(IMAGE, bag.rows[0][3])
+        np.testing.assert_array_equal(image, np.full((2, 3), round(0.299 * 200)))
 
 
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_begin_at_the_top_left(pattern):
-    red = np.zeros((8, 8), np.uint8)
-    for place, colour in enumerate(pattern):
-        if colour == "r":
-            red[place // 2 :: 2, place % 2 :: 2] = 200
-    bag = Bag("mcap")
-    bag.image("/a", 1, red, f"bayer_{pattern}8")
-    image = grey_image(IMAGE, bag.rows[0][3])
-    assert np.all(np.abs(image[2:-2, 2:-2].astype(int) - 60) <= 1)  # 0.299 of red everywhere
+def test_bayer_patterns_begin_at_the_top_left():
+    for pattern in ("rggb", "bggr", "gbrg", "grbg"):
+        red, place = np.zeros((8, 8), np.uint8), pattern.index("r")
+        red[place // 2 :: 2, place % 2 :: 2] = 200
+        bag = Bag("mcap")
+        bag.image("/a", 1, red, f"bayer_{pattern}8")
+        image = grey_image(IMAGE, bag.rows[0][3])
+        assert np.all(np.abs(image[2:-2, 2:-2].astype(int) - 60) <= 1)  # 0.299 of red everywhere

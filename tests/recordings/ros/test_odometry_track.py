@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxnav.recordings.other.odometry_delay import odometry_delay
-from jaxnav.recordings.ros.odometry_track import GrowingTrack, OdometryTrack
+from jaxnav.recordings.ros.odometry_track import GrowingTrack, OdometryTrack, odometry_delay
 
 STAMPS_NS = np.arange(100) * 200_000_000  # 20 s of frames at 5 Hz
 IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
