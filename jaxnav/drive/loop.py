@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.drive.expectation import Expectation
+from jaxnav.drive.expect import Expectation
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.guard import Guard
@@ -275,7 +275,7 @@ class Loop:
                 "frame to command", (self._now_ns() - given.frames[0].stamp_ns) / 1e6
             )
         self._outcome = outcome
-        self._expectation.update(outcome)
+        self._expectation.update(outcome.output, outcome.belief.bank, outcome.now_ns)
         for observer in self._observers:
             observer.on_outcome(given, outcome)
 

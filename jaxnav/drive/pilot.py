@@ -24,7 +24,6 @@ from jaxnav.core.models.origin import ZERO, Origin, planar_in_world, poses_in_wo
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.core.pose.refine import Candidates
 from jaxnav.drive.actuation import Actuation
-from jaxnav.drive.camera_votes import CameraVotes
 from jaxnav.drive.chassis import chassis_of, pace_mps, root_of_sum
 from jaxnav.drive.compiled_step import strip_static
 from jaxnav.drive.corrections import Corrections
@@ -32,19 +31,17 @@ from jaxnav.drive.estimator import Estimator, Program, gyro_of
 from jaxnav.drive.expect import Place, due_px, quads_px
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections, FrameIntake
-from jaxnav.drive.gyro_track import GyroTrack
+from jaxnav.drive.gyro import TurnVotes
 from jaxnav.drive.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
 from jaxnav.drive.history import EventData
 from jaxnav.drive.interfaces import GyroReading, Reading
-from jaxnav.drive.leaving import Corridor
 from jaxnav.drive.limits import Command
 from jaxnav.drive.odometer import Odometers
-from jaxnav.drive.outvoted import MarkerVotes, Twins
+from jaxnav.drive.outvoted import CameraVotes, MarkerVotes, Twins
 from jaxnav.drive.stamps import Stamps
 from jaxnav.drive.standstill import Standstill, Way, between
 from jaxnav.drive.support import Support
-from jaxnav.drive.turn_votes import TurnVotes
-from jaxnav.drive.ways import Fix
+from jaxnav.drive.ways import Corridor, Fix
 from jaxnav.files.poses import rotated
 
 SLEPT_NS = 1_000_000_000  # after a pause this long in the loop, its belief is out of date
@@ -185,13 +182,9 @@ class Pilot:
         self.limits = self._chassis.limits
         self._corrections = Corrections.of(navigator.controller.vehicle)
         gyro = gyro_of(navigator)
-        self._gyro = None if gyro is None else GyroTrack(float(gyro.saturation_radps))
-        mean_radps = None if self._gyro is None else self._mean_radps
+        self._turns = None if gyro is None else TurnVotes(self._chassis, gyro)
+        mean_radps = None if self._turns is None else self._turns.mean_radps
         self._estimator = Estimator(navigator, program, mean_radps)
-        self._turns: TurnVotes | None = None
-        if self._gyro is not None and gyro is not None:
-            bias_radps = float(gyro.bias_sigma_radps)
-            self._turns = TurnVotes(self._chassis, bias_radps, self._gyro.mean_radps)
         self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._drives = drives
@@ -232,8 +225,8 @@ class Pilot:
     def handle(self, given: Input) -> Outcome:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
-        if self._gyro is not None:
-            faults |= self._gyro.take(given.gyro, now_ns)
+        if self._turns is not None:
+            faults |= self._turns.track.take(given.gyro, now_ns)
         frames = [self._corrections.correct_frame(frame) for frame in given.frames]
         data, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
@@ -330,8 +323,10 @@ class Pilot:
         if self._drives:
             doubts |= self._actuation.faults
         faults |= doubts
-        if self._turns is not None and self._turns.gyro_is_wrong:
-            faults |= Fault.GYRO_CONTRADICTED
+        if self._turns is not None:
+            faults |= Fault.GYRO_CONTRADICTED if self._turns.gyro_is_wrong else _NO_FAULT
+            stale = self._age_s(self._turns.track.newest_ns, now_ns) > GYRO_STALE_S
+            faults |= Fault.GYRO_STALE if stale else _NO_FAULT
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
         faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
         faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
@@ -349,8 +344,6 @@ class Pilot:
         self._known, self._now_ns = known, now_ns
         if self._standstill.nothing_moves:
             faults |= Fault.NOTHING_MOVES
-        if self._gyro is not None and self._age_s(self._gyro.newest_ns, now_ns) > GYRO_STALE_S:
-            faults |= Fault.GYRO_STALE
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
         factor = 0.0 if Fault.HELD in faults else SPEED_FACTOR[health]
         command = self._limited(known, factor, now_ns, elapsed_ns)
@@ -526,12 +519,6 @@ class Pilot:
         self._restarts_before, self._restart_reason = self._restarts, reason
         self._fix_ns, self._distance_m = None, 0.0
         self._left = self._known
-
-    def _mean_radps(self, begin_ns: int, end_ns: int) -> float:
-        """What the gyro tells of the interval between two times; NaN: nothing, or it is wrong."""
-        assert self._gyro is not None
-        assert self._turns is not None
-        return math.nan if self._turns.gyro_is_wrong else self._gyro.mean_radps(begin_ns, end_ns)
 
     def _seeing(self, now_ns: int) -> bool:
         """Whether recent corners tell how fast the vehicle is."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxnav.core.models.camera import Camera as CameraModel
 from jaxnav.detection.families import marker_cells, printed
@@ -21,6 +20,7 @@ from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.track import warm_up_fits
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
+from jaxnav.drive.expect import Region
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FROZEN_AFTER, FrameDetections
 from jaxnav.drive.guard import Guard
@@ -44,28 +44,6 @@ class SearchedFrame:
     sighted: FrameDetections
     frame: Frame
     camera_name: str
-
-
-@dataclass(frozen=True)
-class Region:
-    """The expected places of K markers in an image.
-
-    Attributes:
-        quads_px: (K, 4, 2), corners, TL TR BR BL.
-        radius_px: (K,), search radii.
-        keys: family and id of each marker; left out, none of them is followed.
-        flow_px_s: (K, 2), velocities of their centres in the image; None if nobody knows them.
-        stamp_ns: the time at which they are expected there; None: that of the image.
-        decided: False: they are expected by one hypothesis or another, a marker perhaps in several
-            places, and the whole image is searched as well.
-    """
-
-    quads_px: Float[np.ndarray, "K 4 2"]
-    radius_px: Float[np.ndarray, " K"]
-    keys: tuple[tuple[str, int], ...] = ()
-    flow_px_s: Float[np.ndarray, "K 2"] | None = None
-    stamp_ns: int | None = None
-    decided: bool = True
 
 
 class Search:

@@ -15,9 +15,9 @@ copy of the marker elsewhere looks like the marker.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from jaxnav.drive.actuation import Propulsion
 from jaxnav.drive.chassis import Chassis, Motion, pace_mps
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.propulsion import Propulsion
 from jaxnav.drive.ways import Fix, Ranges, Ways
 
 CONFIRMED = 2  # frames in a row, with the first: a single one never confirms
