@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.core.models.markers import MarkerMap
@@ -91,19 +91,18 @@ class Delay(NamedTuple):
         return self.known and abs(self.delay_s) - SURE_SIGMAS * self.sigma_s > HARMLESS_S
 
 
-class Stretch(NamedTuple):
+class _Stretch(NamedTuple):
     """One camera's views and the odometry of a stretch; times in s since its beginning."""
 
-    camera: int
-    start_pose: Float[np.ndarray, " 3"]
-    edges_s: Float[np.ndarray, " K"]  # time from which each reading holds
-    speed_mps: Float[np.ndarray, " K"]
-    steering_rad: Float[np.ndarray, " K"]
-    times_s: Float[np.ndarray, " V"]
-    marker: Int[np.ndarray, " V"]
-    corners_px: Float[np.ndarray, "V 4 2"]
-    sigma_px: Float[np.ndarray, "V 4"]
-    used: Bool[np.ndarray, " V"]
+    camera: Any  # int32
+    edges_s: Any  # (K,), time from which each reading holds
+    speed_mps: Any  # (K,)
+    steering_rad: Any  # (K,)
+    times_s: Any  # (V,)
+    marker: Any  # (V,)
+    corners_px: Any  # (V, 4, 2)
+    sigma_px: Any  # (V, 4)
+    used: Any  # (V,)
 
 
 class _View(NamedTuple):
@@ -175,7 +174,7 @@ class CameraDelays:
         """Compile the program, or load it."""
         one = _View(10**9, np.zeros(1, int), np.zeros(1, int), np.zeros((1, 4, 2)), np.ones((1, 4)))
         readings = [(k * 10**8, 0.1, 0.0) for k in range(30)]
-        self._equations(_stretch(0, 0, np.zeros(3), readings, [one], self._dtype), 0 * _PRIOR)
+        self._equations(_stretch(0, 0, readings, [one], self._dtype), 0 * _PRIOR)
 
     def solve(self) -> None:
         """Solve the oldest finished stretch, camera by camera."""
@@ -196,8 +195,8 @@ class CameraDelays:
             ]
             if len(among) < _LEAST_VIEWS:
                 continue
-            stretch = _stretch(camera, begin_ns, pose, readings, among, self._dtype)
-            delay_s, information = self._solved(stretch)
+            stretch = _stretch(camera, begin_ns, readings, among, self._dtype)
+            delay_s, information = self._solved(stretch, pose)
             if information > 0:
                 self._sums[camera] += information * np.array([1.0, delay_s, delay_s**2])
                 self._counts[camera] += 1
@@ -217,11 +216,9 @@ class CameraDelays:
         """Whether a camera, or all together, are surely later or earlier than is harmless."""
         return self.common_delay.late or any(one.late for one in self.delays)
 
-    def _solved(self, stretch: Stretch) -> tuple[float, float]:
+    def _solved(self, stretch: _Stretch, pose: np.ndarray) -> tuple[float, float]:
         """The delay in s and its information in 1/s^2, 0 where it can't be determined."""
-        p = np.zeros(len(_PRIOR))
-        p[:3] = stretch.start_pose
-        start = p.copy()
+        p = start = np.append(pose, np.zeros(len(_PRIOR) - 3))
         for _ in range(_STEPS):
             A, b, chi2 = self._equations(stretch, p)
             A = A + np.diag(1 / _PRIOR**2)
@@ -245,9 +242,8 @@ class CameraDelays:
         delay_s = p[_DELAY] / (variance * information)
         return float(delay_s), information / (_INFLATION**2 * max(chi2 / max(numbers, 1), 1.0))
 
-    def _equations(self, stretch: Stretch, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        arguments = (np.int32(stretch.camera), *stretch[2:], p.astype(self._dtype))
-        A, b, chi2 = jax.device_get(_normal(*self._world, *arguments))
+    def _equations(self, stretch: _Stretch, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        A, b, chi2 = jax.device_get(_normal(*self._world, stretch, p.astype(self._dtype)))
         return A.astype(float), b.astype(float), float(chi2)
 
 
@@ -265,11 +261,10 @@ def _of_stretches(sums: np.ndarray, count: int) -> Delay:
 def _stretch(
     camera: int,
     begin_ns: int,
-    start_pose: np.ndarray,
     readings: Sequence[tuple[int, float, float]],
     views: Sequence[_View],
     dtype: np.dtype,
-) -> Stretch:
+) -> _Stretch:
     """A stretch in arrays of fixed size; a reading holds from midway after the one before."""
     readings = _thinned(readings, _READINGS)
     # One row for each marker at each instant.
@@ -284,9 +279,8 @@ def _stretch(
         return np.concatenate([array, np.repeat(array[-1:], extra, axis=0)])
 
     sigma_px = np.hypot(sigmas_px, math.hypot(MODEL_SIGMA_PX, _SCATTER_PX))
-    return Stretch(
-        camera,
-        start_pose,
+    return _Stretch(
+        np.int32(camera),
         # Padding begins after every time that is used.
         np.concatenate([edges_s, np.full(rest, 1e3)]).astype(dtype),
         padded([speed_mps for _, speed_mps, _ in readings], rest),
@@ -310,18 +304,11 @@ def _normal(
     rig: CameraRig,
     markers: MarkerMap,
     wheelbase_m: Array,
-    camera: Array,
-    edges_s: Array,
-    speed_mps: Array,
-    steering_rad: Array,
-    times_s: Array,
-    marker: Array,
-    corners_px: Array,
-    sigma_px: Array,
-    used: Array,
+    stretch: _Stretch,
     p: Array,
 ) -> tuple[Array, Array, Array]:
     """Normal equations of the views' whitened residuals, and their chi-square, at `_PRIOR`'s p."""
+    camera, edges_s, speed_mps, steering_rad, times_s, marker, corners_px, sigma_px, used = stretch
 
     def residuals(p: Array) -> tuple[Array, Array]:
         speed, steering = (1 + p[6]) * speed_mps, (1 + p[7]) * steering_rad + p[8]
@@ -350,16 +337,16 @@ def _normal(
         x_m, y_m = c * moved_m[:, 0] - s * moved_m[:, 1], s * moved_m[:, 0] + c * moved_m[:, 1]
         poses = jnp.stack([p[0] + x_m, p[1] + y_m, times[:-1, 2] + turn], axis=1)
 
-        points_world = markers.corners_world_m[marker]
-        one = jax.tree.map(lambda leaf: leaf[camera], rig.cameras)
-        T_camera_vehicle = jax.tree.map(lambda leaf: leaf[camera], rig.Ts_camera_vehicle)
+        one, T_camera_vehicle = jax.tree.map(
+            lambda leaf: leaf[camera], (rig.cameras, rig.Ts_camera_vehicle)
+        )
 
         def seen(pose: Array, points: Array) -> Array:
             points = transform_points(T_world_vehicle_from_planar(pose).inverse(), points)
             points = transform_points(T_camera_vehicle, points)
             return one.project(points + jnp.cross(p[3:6][None], points))
 
-        px = jax.vmap(seen)(poses, points_world) - corners_px
+        px = jax.vmap(seen)(poses, markers.corners_world_m[marker]) - corners_px
         r = (px / sigma_px[..., None]).reshape(len(times_s), 8)
         return r, r
 

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from jaxnav.drive.corrections import Corrections
 from jaxnav.drive.guard_process import (
@@ -45,14 +45,6 @@ _RECEIVES_S = 0.3  # for the spare to receive an order, before another one is st
 _LOOK_S = 0.05
 _LONGEST_LOOK_S = 0.1  # counted of one look: a pause of the whole machine is no silence
 _LATEST_S = 0.03  # the guard looks every 20 ms: its deadline is this much before the timeout
-
-
-class Connected(Protocol):
-    """One end of a socket or pipe."""
-
-    def fileno(self) -> int: ...
-
-    def close(self) -> None: ...
 
 
 class GuardProcess:
@@ -134,7 +126,7 @@ class GuardProcess:
                 "seed": setup.seed,
                 "options": dict(setup.options),
             },
-            "limits": asdict(limits),  # type: ignore[call-overload]
+            "limits": asdict(limits),
             "corrections": asdict(Corrections.of(setup.vehicle)),
             "timeout_s": timeout_s,
             "resumes": resumes,
@@ -204,6 +196,7 @@ class MovedVehicle:
     """A vehicle in another process. It sends commands without waiting, and requests readings.
 
     Attributes:
+        timeout_s, over: see `Vehicle` and `Ending`; `over` as sent with the last reading.
         replaced: what befell the guard's process where another one had to stop the vehicle.
         unheard: for a person, after `close`: why the vehicle may not have stopped; None: it has.
     """
@@ -212,12 +205,13 @@ class MovedVehicle:
         self, guarding: GuardProcess, own_timeout_s: float, priority: str, timeout_s: float
     ):
         """See `GuardProcess.open`."""
-        self._guarding, self._own_timeout_s, self.priority = guarding, own_timeout_s, priority
+        self._guarding, self.priority = guarding, priority
+        self.timeout_s = own_timeout_s if own_timeout_s > 0 else math.inf
         self._timeout_ns = int((timeout_s - _LATEST_S) * 1e9)
         self.replaced: str | None = None
         self.unheard: str | None = None
         self._sequence = 0
-        self._over: str | None = None
+        self.over: str | None = None
         self._gyro: tuple[GyroReading, ...] = ()  # that came with readings, and were not asked for
         self._asked_s: float | None = None  # when the pending reading was requested
         self._stop_s: float | None = None  # when the first stop was
@@ -236,16 +230,6 @@ class MovedVehicle:
     def pid(self) -> int:
         """The id of the guard's process."""
         return self._guarding.process.pid
-
-    @property
-    def timeout_s(self) -> float:
-        """See `Vehicle`."""
-        return self._own_timeout_s if self._own_timeout_s > 0 else math.inf
-
-    @property
-    def over(self) -> str | None:
-        """See `Ending`; as sent with the vehicle's last reading."""
-        return self._over
 
     def watch(
         self, report: Callable[[str, bool], None], late: Callable[[], bool] = lambda: False
@@ -284,7 +268,7 @@ class MovedVehicle:
             assert kind == KIND_FAILED
             raise OSError(answer[-1][1:].decode(errors="replace"))
         reading, gyro, over = reading_from(answer[-1])
-        self._over = over or None
+        self.over = over or None
         self._gyro += gyro
         return reading
 
@@ -450,12 +434,12 @@ def import_path() -> list[str]:
 
 
 def start_python(
-    module: str, ends: Sequence[Connected], environment: Mapping[str, str]
+    module: str, ends: Sequence[Any], environment: Mapping[str, str]
 ) -> subprocess.Popen[bytes]:
     """Start a Python that runs a module and nothing of the current folder.
 
     Args:
-        ends: of sockets, which it gets as arguments, and which are closed here.
+        ends: of sockets or pipes, which it gets as arguments, and which are closed here.
 
     Raises:
         OSError: the machine has no room for another process.

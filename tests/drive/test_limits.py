@@ -15,7 +15,7 @@ anything = st.floats() | st.integers(-(10**300), 10**300)
 
 @given(anything, anything, anything, anything)
 def test_any_command_is_finite_and_inside_the_limits(steering, throttle, last, elapsed_s):
-    told_rad, told = LIMITS.apply(steering, throttle, last, elapsed_s)
+    told_rad, told = LIMITS.within((steering, throttle), (last, 0.0), elapsed_s)
     assert abs(told_rad) <= LIMITS.steering_rad
     assert abs(told) <= LIMITS.throttle
     if not (math.isfinite(steering) and math.isfinite(throttle)):
@@ -24,18 +24,18 @@ def test_any_command_is_finite_and_inside_the_limits(steering, throttle, last, e
 
 @given(st.floats(), st.floats(-0.5, 0.5), st.floats(0, 1))
 def test_the_steering_moves_no_faster_than_it_may(steering, last, elapsed_s):
-    told_rad, _ = LIMITS.apply(steering, 0.1, last, elapsed_s)
+    told_rad, _ = LIMITS.within((steering, 0.1), (last, 0.0), elapsed_s)
     assert abs(told_rad - last) <= 5.0 * elapsed_s + 1e-12
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.3, 0.3))
 def test_what_is_inside_the_limits_stays_as_it_is(steering, throttle):
-    assert LIMITS.apply(steering, throttle, 0.0, 1.0) == (steering, throttle)
+    assert LIMITS.within((steering, throttle), (0.0, 0.0), 1.0) == (steering, throttle)
 
 
 @pytest.mark.parametrize("elapsed_s", [0.0, -1.0, math.nan, -math.inf])
 def test_without_a_time_that_went_by_the_steering_stays(elapsed_s):
-    assert LIMITS.apply(0.4, 0.1, 0.2, elapsed_s) == (0.2, 0.1)
+    assert LIMITS.within((0.4, 0.1), (0.2, 0.0), elapsed_s) == (0.2, 0.1)
 
 
 def test_the_limits_are_the_vehicles():

@@ -13,6 +13,7 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.detection import Tracker, make_detector
 from jaxnav.detection.signs_of_life import sign
 from jaxnav.detection.types import Detections
+from jaxnav.drive.expect import Region
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.guard import TIMEOUT_S, Guard
@@ -20,7 +21,7 @@ from jaxnav.drive.interfaces import MOST_TURNS, Frame, GyroReading, Odometry
 from jaxnav.drive.limits import limits_of
 from jaxnav.drive.loop import Loop
 from jaxnav.drive.pilot import Input, Pilot
-from jaxnav.drive.seeing import Eyes, Region, Search, SearchedFrame, group_frames, image_fault
+from jaxnav.drive.seeing import Eyes, Search, SearchedFrame, group_frames, image_fault
 from jaxnav.drive.standing_clock import STANDS_S, StandingClock
 from tests import worlds
 from tests.helpers.other_pictures import other_pictures

@@ -21,7 +21,8 @@ from jaxnav.drive.pilot import Input, Outcome, Pilot
 from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.records import digest
 from jaxnav.vehicles.conformance import injections as inject
-from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Rates, Step
+from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Rates, Step, drive
+from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers.simulated import make_setup, simulated
 
@@ -451,3 +452,22 @@ def test_a_vehicle_that_the_guard_holds_is_known_to_stand_and_to_be_well(setup):
     assert {outcome.health for outcome in held[len(held) // 2 :]} == {Health.OK}
     assert steps[-1].outcome.throttle > 0
     assert steps[-1].outcome.health is Health.OK
+
+
+def test_who_leaves_the_route_stands(setup):
+    """Carried away by a metre, it knows where it is again, and does not drive from there."""
+    setup = dataclasses.replace(setup, route=dataclasses.replace(setup.route, leave_m=0.5))
+    route = setup.route
+    world = SimWorld(setup.rig, setup.markers, setup.vehicle, route.start_pose, BEGIN_NS)
+    carried = [(1.2, -0.8, 0.0)]
+
+    def happens(now_ns: int, world: SimWorld) -> None:
+        if now_ns > BEGIN_NS + 2_000_000_000 and carried:
+            world.carry_off(carried.pop())
+
+    outcomes = [step.outcome for step in drive(setup.pilot(None), world, 6.0, happens=happens)]
+    left = [outcome for outcome in outcomes if Fault.LEFT_ROUTE in outcome.faults]
+    assert left
+    assert {outcome.health for outcome in left} == {Health.STOP}
+    assert left[-1].command[1] == 0.0
+    assert not any(Fault.LEFT_ROUTE in o.faults for o in outcomes if o.now_ns < BEGIN_NS + 2e9)
