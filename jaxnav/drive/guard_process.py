@@ -330,7 +330,7 @@ def opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
     setup = Setup(
         missing("rig"), missing("markers"), numbers, start, received["seed"], received["options"]
     )
-    return plugins.opened_vehicle(order["vehicle"], factory, setup)
+    return plugins.open_vehicle(order["vehicle"], setup, factory)
 
 
 def _preferred() -> str:
@@ -345,16 +345,11 @@ def _preferred() -> str:
     return "raised priority" if lower_nice(NICE) else "no priority: it may not be raised here"
 
 
-def _forked() -> int | None:
-    """Fork the spare, before there is a thread; return its id, 0 in itself, None without room."""
-    with suppress(OSError):
-        return os.fork()
-    return None
-
-
 if __name__ == "__main__":
     ends = [int(number) for number in sys.argv[1:]]
-    child = _forked()
+    child = None
+    with suppress(OSError):  # without room there is no spare
+        child = os.fork()  # before there is a thread
     for end in ends[:2] if child == 0 else ends[2:]:
         os.close(end)  # whoever is at the other end must notice this one's death
     with FreeOutput():  # a driver that prints errors must not wait for a reader

@@ -84,22 +84,15 @@ class History:
             new: the entry that `place` has made; the next late event may start from it.
             then: the belief after the new entry.
         """
-        new.belief = then
-        self._entries[-1].belief = belief
-        self._thin()
-        self._forget()
-
-    def _thin(self) -> None:
-        """Drop the reading before the newest if it follows its predecessor too soon."""
-        last = self._entries[-3:]
-        if len(last) == 3 and all(entry.data and entry.data.corners_px is None for entry in last):
-            before, middle, _ = last
-            if middle.stamp_ns - before.stamp_ns < THIN_NS:
-                del self._entries[-2]
-
-    def _forget(self) -> None:
-        """Drop all entries before the belief from which the oldest allowed event can start."""
         entries = self._entries
+        new.belief = then
+        entries[-1].belief = belief
+        # The reading before the newest goes if it follows its predecessor too soon.
+        last = entries[-3:]
+        if len(last) == 3 and all(entry.data and entry.data.corners_px is None for entry in last):
+            if last[1].stamp_ns - last[0].stamp_ns < THIN_NS:
+                del entries[-2]
+        # So does all before the belief from which the oldest allowed event can start.
         oldest_ns = entries[-1].stamp_ns - OLD_NS
         base = 0
         for index, entry in enumerate(entries):
@@ -108,8 +101,3 @@ class History:
             if entry.belief is not None:
                 base = index
         del entries[: max(base, len(entries) - KEPT)]
-
-    @property
-    def newest_ns(self) -> int:
-        """The stamp of the newest event."""
-        return self._entries[-1].stamp_ns
