@@ -18,7 +18,7 @@ from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.detection import Detections
 from jaxnav.drive.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.frames import FrameDetections
+from jaxnav.drive.frames import FrameDetections, FrameIntake
 from jaxnav.drive.history import EventData
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
@@ -217,33 +217,22 @@ def test_nothing_grows_however_long_it_drives():
     assert max(map(len, (delays._readings, delays._views, delays._open))) <= 1024
 
 
-def outcome_of(given: Input, pose: np.ndarray):
+def outcome_of(given: Input, pose: np.ndarray, frames: FrameIntake):
     """Of a pilot that believes all, and knows where it is."""
     outcome = make_outcome(1)
     output = eqx.tree_at(lambda o: (o.pose, o.decided), outcome.output, (pose, np.array(True)))
-    stamp_ns, told = given.now_ns, None
+    told, stamp_ns, _ = frames.check(given.frames, given.now_ns)
     if given.odometry is not None:
-        read = given.odometry
-        stamp_ns, told = read.stamp_ns, EventData((read.speed_mps, read.steering_rad))
-    elif any(frame.detections for frame in given.frames):
-        corners_px, visible = np.zeros((4, 1, 4, 2)), np.zeros((4, 1), bool)
-        for frame in given.frames:
-            if frame.detections:
-                corners_px[frame.camera] = frame.detections.corners_px
-                visible[frame.camera] = True
-        stamp_ns, told = (
-            given.frames[0].stamp_ns,
-            EventData(None, corners_px, visible, np.ones((4, 1, 4))),
-        )
+        told, stamp_ns = EventData(given.odometry.values), given.odometry.stamp_ns
     return dataclasses.replace(
         outcome, now_ns=given.now_ns, stamp_ns=stamp_ns, data=told, output=output
     )
 
 
 def test_while_it_drives_one_warning_is_given(capsys):
-    watch = DelayWatch(SETUP, warns=True)
+    watch, frames = DelayWatch(SETUP, warns=True), FrameIntake(len(RIG), MARKERS)
     for given, pose in Drive(0.06).inputs():
-        watch.on_outcome(given, outcome_of(given, pose))
+        watch.on_outcome(given, outcome_of(given, pose, frames))
     for _ in range(3000):
         if watch.faults:
             break

@@ -86,9 +86,7 @@ def test_without_a_calibration_nothing_is_touched(speed_mps, steering_rad, stamp
 
 def test_the_servo_turns_no_further_than_its_limit():
     corrections = Corrections.of(vehicle(steering_gain=0.5))
-    assert corrections.servo_rad(0.5) == 0.5
-    assert corrections.servo_rad(-0.5) == -0.5
-    assert corrections.servo_rad(0.02) == 0.0
+    assert [corrections.servo_rad(rad) for rad in (0.5, -0.5, 0.02)] == [0.5, -0.5, 0.0]
 
 
 def test_the_guard_tells_the_servo_what_makes_the_angle_true():
@@ -107,13 +105,8 @@ def test_the_guard_tells_the_servo_what_makes_the_angle_true():
 
     car = Car()
     clock = iter(range(0, 10**12, 10**8))  # 0.1 s between two looks at it
-    guard = Guard(
-        car,
-        Limits(0.5, 1e3, 0.3),
-        timeout_s=1e3,
-        now_ns=lambda: next(clock),
-        corrections=Corrections.of(vehicle()),
-    )
+    limits, told = Limits(0.5, 1e3, 0.3), Corrections.of(vehicle())
+    guard = Guard(car, limits, 1e3, now_ns=lambda: next(clock), corrections=told)
     guard.arm()
     guard.write(0.3, 0.1)
     guard.close()

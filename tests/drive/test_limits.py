@@ -6,10 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.drive.limits import Limits
+from jaxnav.core.models.vehicle import TwistBase
+from jaxnav.drive.limits import Limits, TwistLimits, limits_from, limits_of
 from tests import worlds
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
+BASE = TwistLimits(forward_mps=1.0, left_mps=0.5, turn_radps=3.0)
 anything = st.floats() | st.integers(-(10**300), 10**300)
 
 
@@ -43,3 +45,19 @@ def test_the_limits_are_the_vehicles():
     limits = Limits.of(vehicle)
     assert (limits.steering_rad, limits.throttle) == (0.5, float(vehicle.throttle_limit))
     assert limits.steering_rate_radps == float(vehicle.steering_rate_limit_radps)
+
+
+@given(st.tuples(anything, anything, anything), st.floats())
+def test_any_twist_is_cut_at_each_limit_and_one_that_is_no_number_is_zero(command, elapsed_s):
+    told = BASE.within(command, (0.0, 0.0, 0.0), elapsed_s)
+    if not all(map(math.isfinite, command)):
+        assert told == (0.0, 0.0, 0.0)
+        return
+    for part, limit, wanted in zip(told, (1.0, 0.5, 3.0), command, strict=True):
+        assert part == (wanted if abs(wanted) <= limit else math.copysign(limit, wanted))
+
+
+def test_the_limits_of_a_base_are_the_files():
+    base = TwistBase.create(1.2, 3.0, 0.1, left_limit_mps=0.7)
+    assert limits_of(base) == TwistLimits(*map(float, (base.limits)))
+    assert limits_from({"forward_mps": 1.0, "left_mps": 0.5, "turn_radps": 3.0}) == BASE

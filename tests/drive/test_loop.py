@@ -31,9 +31,10 @@ NONE = Detections.concatenate([])
 
 
 class Car:
-    """Stands where it is, and remembers what it was told."""
+    """Stands where it is, remembers what it was told, and may have nothing more to drive."""
 
     timeout_s = math.inf
+    over = None
 
     def __init__(self):
         self.told = []
@@ -347,14 +348,8 @@ def test_it_ends_when_its_time_is_over(standing):
         assert not drive.loop.stopped
 
 
-class Recorded(Car):
-    """Has nothing more to drive, some time."""
-
-    over = None
-
-
 def test_it_ends_in_good_order_when_the_vehicle_has_nothing_more_to_drive(standing):
-    with Drive(standing, Recorded()) as drive:
+    with Drive(standing) as drive:
         drive.car.over = "the tape is over"
         drive.thread.join(1)
         assert drive.ended == "the tape is over"
@@ -401,7 +396,7 @@ def test_an_observer_that_raises_ends_nothing_and_is_named_counted_and_a_fault(
 
 
 def test_a_drive_that_the_guard_ends_was_stopped(standing):
-    with Drive(standing, Recorded()) as drive:
+    with Drive(standing) as drive:
         drive.guard.trip("enough")
         drive.thread.join(1)
         assert drive.ended == "enough"
@@ -425,7 +420,7 @@ class Backlog:
 def test_images_that_have_waited_do_not_keep_the_odometer_waiting(standing):
     """Each takes the pilot 30 ms, and the odometer is read every 20."""
     now_ns = [10**9]
-    car = Recorded()
+    car = Car()
     loop = Loop(standing, Guard(car, standing.limits), car, Backlog(), now_ns=lambda: now_ns[0])
 
     def handle_for_a_while():

@@ -64,21 +64,14 @@ def test_one_that_agrees_again_is_believed_again():
     assert votes.remove_outvoted(alone) is alone
 
 
-@pytest.mark.parametrize("ids", [(0,), (0, 1)])
-def test_maps_too_small_to_vote_hide_nothing(ids):
-    votes = MarkerVotes(ids)
-    seen = told(*range(len(ids)), count=len(ids))
+@pytest.mark.parametrize(("ids", "in_view"), [((0,), 1), ((0, 1), 2), (IDS, 2)])
+def test_frames_that_show_too_few_do_not_count(ids, in_view):
+    """Also of a map that has no more."""
+    votes, count = MarkerVotes(ids), len(ids)
     for _ in range(50):
-        votes.count(seen, np.ones(len(ids), bool))
+        votes.count(told(*range(in_view), count=count), np.arange(count) < in_view)
     assert votes.outvoted == ()
-    assert votes.remove_outvoted(seen) is seen
-
-
-def test_frames_that_show_too_few_do_not_count():
-    votes, alone = MarkerVotes(IDS), told(0)
-    for _ in range(50):
-        votes.count(told(0, 1), voted(0))
-    assert votes.outvoted == ()
+    alone = told(0, count=count)
     assert votes.remove_outvoted(alone) is alone
 
 
