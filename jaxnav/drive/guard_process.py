@@ -9,7 +9,7 @@ comes too late is not obeyed, and when none comes in time the vehicle is stopped
 once when the computing process ends, however it ends, since that closes the sockets.
 
 On the first socket JSON and commands come in and events go out; on the second a byte requests a
-reading. All of these are framed, see `Link`. Once it has tripped, it says ten times a second
+reading. All are messages of `multiprocessing`. Once it has tripped, it says ten times a second
 whether the vehicle has heard the stop. A driver that holds the interpreter silences it, and so does
 one that does not come back from `stop`.
 
@@ -24,13 +24,13 @@ import json
 import os
 import select
 import signal
-import socket
 import struct
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -62,7 +62,6 @@ KIND_COMMAND, KIND_TEXT, KIND_READING, KIND_FAILED = b"c", b"t", b"r", b"f"
 HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle that does not hear
 _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
 _PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
-_LARGEST = 2**24
 _SAYS_S = 0.1  # period at which it says whether a stop was heard; `moved_vehicle` waits for five
 # A `stop` that lasts longer counts as no answer. With the longest wait for a command (0.2 s by
 # default) and for an answer (0.5 s) it leaves 0.8 of 2 s for another one to open the vehicle.
@@ -101,59 +100,19 @@ def reading_from(frame: bytes) -> tuple[Reading, tuple[GyroReading, ...], str]:
     return reading_of(stamp_ns, values, valid), gyro, frame[end:].decode()
 
 
-class Link:
-    """Messages over a stream socket, each a frame: four bytes of length, then the content."""
+def tell(link: Connection, **said: Any) -> None:
+    """Send a mapping as JSON."""
+    link.send_bytes(KIND_TEXT + json.dumps(said).encode())
 
-    def __init__(self, end: socket.socket):
-        self.socket = end
-        self._begun = b""
-        self._frames: list[bytes] = []
 
-    def send(self, content: bytes) -> None:
-        """Send one frame completely, or raise OSError."""
-        self.socket.sendall(struct.pack("<I", len(content)) + content)
+def told(link: Connection) -> dict[str, Any]:
+    """Wait for the next mapping and return it.
 
-    def tell(self, **said: Any) -> None:
-        """Send a mapping as JSON."""
-        self.send(KIND_TEXT + json.dumps(said).encode())
-
-    def ready(self, timeout_s: float) -> bool:
-        """Wait until `receive` would not; return whether that is so before the time is over."""
-        look = select.poll()  # not `select`, which can't look at descriptors above 1023
-        look.register(self.socket, select.POLLIN)
-        return bool(self._frames or look.poll(timeout_s * 1e3))
-
-    def receive(self) -> list[bytes]:
-        """The complete frames received, possibly none; waits for bytes if no frame is ready.
-
-        Raises:
-            EOFError: the other end is closed.
-            OSError: the socket timed out or broke.
-        """
-        frames, self._frames = self._frames, []
-        if frames:
-            return frames
-        more = self.socket.recv(65536)
-        if not more:
-            raise EOFError
-        self._begun += more
-        while len(self._begun) >= 4:
-            (size,) = struct.unpack_from("<I", self._begun)
-            if size > _LARGEST:
-                raise OSError(f"a frame of {size} bytes")
-            if len(self._begun) < 4 + size:
-                break
-            frames.append(self._begun[4 : 4 + size])
-            self._begun = self._begun[4 + size :]
-        return frames
-
-    def mapping(self) -> dict[str, Any]:
-        """Wait for the next mapping and return it."""
-        while not (frames := self.receive()):
-            pass
-        self._frames = frames[1:]
-        said: dict[str, Any] = json.loads(frames[0][1:])
-        return said
+    Raises:
+        EOFError: the other end is closed.
+    """
+    said: dict[str, Any] = json.loads(link.recv_bytes()[1:])
+    return said
 
 
 class CanNotMoveError(BaseException):
@@ -184,24 +143,24 @@ def main(commands: int, readings: int | None, spare: int | None = None) -> None:
     os.set_blocking(wakeup[1], False)
     signal.set_wakeup_fd(wakeup[1], warn_on_full_buffer=False)
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # sent when the machine shuts down
-    link = Link(socket.socket(fileno=commands))
+    link = Connection(commands)
     with suppress(EOFError, OSError):
-        order = link.mapping()
+        order = told(link)
         only_stops = order.get("only_stops", False)  # in the place of one that hung or died
         if only_stops:
-            link.tell(received=True)
+            tell(link, received=True)
             _preferred()  # before the plug-in is imported, as the vehicle may be driving
         try:
             factory = _factory(order["vehicle"], order["path"])
             if not only_stops:
-                link.tell(ready=True, spare=spare)
-                order |= link.mapping()
+                tell(link, ready=True, spare=spare)
+                order |= told(link)
             vehicle = opened(factory, order)
         except CanNotMoveError as problem:
-            link.tell(stays=str(problem))
+            tell(link, stays=str(problem))
             return
         except BadInput as bad:
-            link.tell(bad=str(bad))
+            tell(link, bad=str(bad))
             return
         priority = _preferred()  # of this thread, and of the guard's thread, which it starts
         guard = Guard(
@@ -213,20 +172,26 @@ def main(commands: int, readings: int | None, spare: int | None = None) -> None:
         )
         threading.Thread(target=_report, args=(guard, link), daemon=True).start()
         try:
-            link.tell(opened=float(vehicle.timeout_s), priority=priority)
+            tell(link, opened=float(vehicle.timeout_s), priority=priority)
             if readings is not None and not only_stops:
-                asked = Link(socket.socket(fileno=readings))
-                _Server(vehicle, guard, link, asked, wakeup[0]).serve()
+                _Server(vehicle, guard, link, Connection(readings), wakeup[0]).serve()
         finally:
             guard.close(HEARD_WITHIN_S)
             with suppress(OSError):
-                link.tell(closed=True, unheard=guard.unheard)
+                tell(link, closed=True, unheard=guard.unheard)
 
 
 class _Server:
     """The server of both sockets, until it is told to close."""
 
-    def __init__(self, vehicle: AnyVehicle, guard: Guard, link: Link, asked: Link, signals: int):
+    def __init__(
+        self,
+        vehicle: AnyVehicle,
+        guard: Guard,
+        link: Connection,
+        asked: Connection,
+        signals: int,
+    ):
         self._vehicle, self._guard = vehicle, guard
         self._link, self._asked, self._signals = link, asked, signals
         self._sequence = 0
@@ -234,7 +199,7 @@ class _Server:
     def serve(self) -> None:
         """Serve commands before readings, since a reading may take as long as the driver does."""
         look = select.poll()
-        for descriptor in (self._link.socket, self._asked.socket, self._signals):
+        for descriptor in (self._link, self._asked, self._signals):
             look.register(descriptor, select.POLLIN)
         try:
             while True:
@@ -242,13 +207,12 @@ class _Server:
                 if self._signals in ready:
                     self._guard.trip("the guard's process was told to end (SIGTERM)")
                     os.read(self._signals, 64)
-                if self._link.socket.fileno() in ready:
-                    for frame in self._link.receive():
-                        if not self._obey(frame):
-                            return
-                elif self._asked.socket.fileno() in ready:
-                    for _ in self._asked.receive():
-                        self._asked.send(self._reading())
+                if self._link.fileno() in ready:
+                    if not self._obey(self._link.recv_bytes()):
+                        return
+                elif self._asked.fileno() in ready:
+                    self._asked.recv_bytes()
+                    self._asked.send_bytes(self._reading())
         except (EOFError, OSError):
             self._guard.trip("the process that computes is gone")
 
@@ -259,7 +223,8 @@ class _Server:
             if "stop" in said:
                 self._guard.trip(said["stop"], said["late"])
             if "resume" in said and not self._guard.resume():
-                self._link.tell(tripped=self._guard.reason or "it does not resume", late=False)
+                why = self._guard.reason or "it does not resume"
+                tell(self._link, tripped=why, late=False)
             return "close" not in said
         sequence, deadline_ns, command = command_of(frame)
         if sequence > self._sequence:
@@ -287,7 +252,7 @@ class _Server:
         return ()
 
 
-def _report(guard: Guard, link: Link) -> None:
+def _report(guard: Guard, link: Connection) -> None:
     """Report each trip at once, and then, until it resumes, again and again whether the vehicle has
     heard the stop: in a thread, since the main one may hang in the driver."""
     with suppress(OSError):
@@ -295,10 +260,10 @@ def _report(guard: Guard, link: Link) -> None:
             guard.wait()
             since_s = time.monotonic()
             reason = guard.reason
-            link.tell(tripped=reason, late=guard.late)
+            tell(link, tripped=reason, late=guard.late)
             while guard.tripped and guard.reason == reason:
                 if guard.heard or time.monotonic() - max(since_s, guard.tried_s) < _TRIES_S:
-                    link.tell(heard=guard.heard, unheard=guard.unheard)
+                    tell(link, heard=guard.heard, unheard=guard.unheard)
                 time.sleep(_SAYS_S)
 
 

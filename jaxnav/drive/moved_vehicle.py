@@ -7,11 +7,9 @@ vehicle.watch(guard.trip)                        # called when it was stopped th
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -19,6 +17,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +25,10 @@ from jaxnav.drive.corrections import Corrections
 from jaxnav.drive.guard_process import (
     KIND_FAILED,
     KIND_READING,
-    Link,
     command_frame,
     reading_from,
+    tell,
+    told,
 )
 from jaxnav.drive.interfaces import GyroReading, Setup
 from jaxnav.drive.limits import CommandLimits
@@ -70,7 +70,7 @@ class GuardProcess:
         self._opens = False
         self._order: dict[str, Any] = {"vehicle": name, "path": import_path()} | (order or {})
         self.spare_pid: int | None = None
-        ours, theirs = zip(*(socket.socketpair() for _ in range(3)), strict=True)
+        ours, theirs = zip(*(Pipe() for _ in range(3)), strict=True)
         # OpenBLAS would allocate memory for a thread per core, and all of it would be locked.
         try:
             self.process = start_python(_MODULE, theirs, {"OPENBLAS_NUM_THREADS": "1"})
@@ -78,8 +78,8 @@ class GuardProcess:
             for end in ours:
                 end.close()
             raise
-        self.commands, self.readings, self.spare = map(Link, ours)
-        self.commands.tell(**self._order)
+        self.commands, self.readings, self.spare = ours
+        tell(self.commands, **self._order)
 
     def prepare(self, check: Callable[[], None]) -> None:
         """Wait until the plug-in is imported there, or is known to stay here.
@@ -133,7 +133,7 @@ class GuardProcess:
         }
         self._order |= changes
         self._opens = True
-        self.commands.tell(**changes)
+        tell(self.commands, **changes)
         answer = self._answer(check)
         if "bad" in answer:
             raise BadInput(*answer["bad"].split(": ", 1))
@@ -151,9 +151,9 @@ class GuardProcess:
         """
         order = self._order | {"only_stops": True}
         with suppress(EOFError, OSError, ValueError):
-            self.spare.tell(**order)
-            if self.spare.ready(_RECEIVES_S):
-                self.spare.mapping()
+            tell(self.spare, **order)
+            if self.spare.poll(_RECEIVES_S):
+                told(self.spare)
                 return _unheard_by(self.spare)
             # It hangs as well: two that hold the vehicle may be one too many.
             if self.spare_pid:
@@ -175,15 +175,15 @@ class GuardProcess:
         if not self._opens:
             self.process.kill()
         for link in (self.commands, self.readings, self.spare):
-            link.socket.close()
+            link.close()
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(1.0)
 
     def _answer(self, check: Callable[[], None]) -> dict[str, Any]:
-        while not self.commands.ready(_LOOK_S):
+        while not self.commands.poll(_LOOK_S):
             check()
         try:
-            answer = self.commands.mapping()
+            answer = told(self.commands)
         except (EOFError, OSError):
             raise BadInput(
                 f"--car {self.name}", f"the guard's process {ending(self.process)}"
@@ -223,7 +223,6 @@ class MovedVehicle:
         self._late: Callable[[], bool] = lambda: False
         self._reason: tuple[str, bool] | None = None
         self._ended = threading.Event()
-        guarding.readings.socket.settimeout(_READ_S)
         threading.Thread(target=self._listen, name="jaxnav-events", daemon=True).start()
 
     @property
@@ -252,22 +251,19 @@ class MovedVehicle:
         """
         link = self._guarding.readings
         if self._asked_s is None:
-            link.send(b"?")
+            link.send_bytes(b"?")
             self._asked_s = time.monotonic()
+        if not link.poll(_READ_S):
+            raise OSError("no reading within a tick")
         try:
-            answer = link.receive()
-        except TimeoutError:
-            raise OSError("no reading within a tick") from None
+            answer = link.recv_bytes()
         except EOFError:
             raise OSError("the guard's process is gone") from None
-        if not answer:
-            raise OSError("no reading within a tick")
         self._asked_s = None
-        kind = answer[-1][:1]
-        if kind != KIND_READING:
-            assert kind == KIND_FAILED
-            raise OSError(answer[-1][1:].decode(errors="replace"))
-        reading, gyro, over = reading_from(answer[-1])
+        if answer[:1] != KIND_READING:
+            assert answer[:1] == KIND_FAILED
+            raise OSError(answer[1:].decode(errors="replace"))
+        reading, gyro, over = reading_from(answer)
         self.over = over or None
         self._gyro += gyro
         return reading
@@ -287,7 +283,8 @@ class MovedVehicle:
             raise OSError(self._dead or "the vehicle is closed")
         self._sequence += 1
         deadline_ns = time.monotonic_ns() + self._timeout_ns
-        self._guarding.commands.send(command_frame(self._sequence, deadline_ns, command))
+        frame = command_frame(self._sequence, deadline_ns, command)
+        self._guarding.commands.send_bytes(frame)
 
     def stop(self) -> None:
         """See `Vehicle`: the guard there trips, and repeats the stop until the vehicle hears it.
@@ -304,13 +301,13 @@ class MovedVehicle:
         if self._dead:
             raise OSError(self._dead)
         with suppress(OSError):  # the process is ending: `_listen` sees to it
-            self._guarding.commands.tell(stop="told to stop", late=self._late())
+            tell(self._guarding.commands, stop="told to stop", late=self._late())
 
     def resume(self) -> bool:
         """See `Resuming`: a refusal is reported as another stop."""
         with suppress(OSError):
             if not (self._dead or self._closed):
-                self._guarding.commands.tell(resume=True)
+                tell(self._guarding.commands, resume=True)
                 self._stop_s = self._reason = None  # an answer is due to the next stop
                 return True
         return False
@@ -322,7 +319,7 @@ class MovedVehicle:
             self._close_s = time.monotonic()
             self._stop_s = self._stop_s or self._close_s
             with suppress(OSError):
-                self._guarding.commands.tell(close=True)
+                tell(self._guarding.commands, close=True)
             self._ended.wait()
             self._closed = True
         self._guarding.end()
@@ -346,15 +343,14 @@ class MovedVehicle:
         try:
             while True:
                 due_before_s, due_s = due_s, self._due_s()
-                news = link.ready(_LOOK_S)
+                news = link.poll(_LOOK_S)
                 now_s = time.monotonic()
                 silent_s += min(now_s - looked_s, _LONGEST_LOOK_S)
                 looked_s = now_s
                 if news or due_s is None or due_s != due_before_s:
                     silent_s = 0.0
-                for frame in link.receive() if news else []:
-                    if self._closes(json.loads(frame[1:])):
-                        return None
+                if news and self._closes(told(link)):
+                    return None
                 answers_s = _DEAF_S if self._stop_s is None else _ANSWERS_S
                 if silent_s > (_CLOSES_S if self._heard else answers_s):
                     return f"the guard's process gave no answer for {silent_s:.1f} s"
@@ -374,7 +370,7 @@ class MovedVehicle:
         """Since when an answer is due: to the first stop, or to a request for a reading."""
         if self._stop_s is not None:
             return self._stop_s
-        return None if self._guarding.readings.ready(0) else self._asked_s
+        return None if self._guarding.readings.poll() else self._asked_s
 
     def _closes(self, said: dict[str, Any]) -> bool:
         """Take an event; return whether it is the last one."""
@@ -404,15 +400,15 @@ class MovedVehicle:
         self._closed = True
 
 
-def _unheard_by(link: Link) -> str | None:
+def _unheard_by(link: Connection) -> str | None:
     """Wait until a process that only stops says that the vehicle has heard it; else why not.
 
     Raises:
         EOFError: it has ended.
     """
     why, end_s = "no other one has opened it yet", time.monotonic() + _CLOSES_S
-    while link.ready(max(end_s - time.monotonic(), 0.0)):
-        said = link.mapping()
+    while link.poll(max(end_s - time.monotonic(), 0.0)):
+        said = told(link)
         if said.get("heard") or ("closed" in said and said["unheard"] is None):
             return None
         why = said.get("unheard") or said.get("bad") or said.get("stays") or why
