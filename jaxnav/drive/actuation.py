@@ -1,10 +1,5 @@
 """Compare the vehicle's motion by the corners with what it was commanded to do.
 
-    actuation.add_command(command, gap_s)     # with every cycle
-    actuation.add_fix(now_ns, fix)            # with every pose that the corners have confirmed
-    actuation.add_headings(now_ns, headings)  # with all others
-    actuation.faults, actuation.gives_up
-
 Each part of a command, the throttle and the steering of a car or the three of a twist, makes a
 motion due that lies between two bounds: its gain is right to a factor, and it may lag. What the
 corners show beyond the bounds is summed and slowly forgotten, so that neither a late servo nor

@@ -73,12 +73,10 @@ class Delay(NamedTuple):
     Attributes:
         delay_s: NaN where nothing is known.
         sigma_s: inf where nothing is known.
-        stretches: how many were used.
     """
 
     delay_s: float
     sigma_s: float
-    stretches: int
 
     @property
     def known(self) -> bool:
@@ -251,11 +249,11 @@ def _of_stretches(sums: np.ndarray, count: int) -> Delay:
     """The mean delay of several stretches; sigma grows where they contradict each other."""
     information, first, second = sums
     if not information > 0:
-        return Delay(math.nan, math.inf, 0)
+        return Delay(math.nan, math.inf)
     mean_s = first / information
     scatter = max(second - information * mean_s**2, 0.0) / max(count - 1, 1)
     sigma_s = math.sqrt(max(scatter, 1.0) / information)
-    return Delay(float(mean_s), max(sigma_s, _LEAST_SIGMA_S), int(count))
+    return Delay(float(mean_s), max(sigma_s, _LEAST_SIGMA_S))
 
 
 def _stretch(

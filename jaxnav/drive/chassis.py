@@ -1,10 +1,5 @@
 """What a vehicle's commands and readings say of its motion: of a car, and of other bases.
 
-    chassis = chassis_of(vehicle)
-    chassis.motion(reading)         # in the vehicle's own axes
-    chassis.driven_mps(reading)     # the speed of each driven part
-    chassis.wanted_mps(command)     # the speed towards which each is driven
-
 The checks of the loop ask whether a reading can be, whether anything moves, and how far. So they
 look at driven parts, each of which follows its command with a lag of first order and has its speed
 in m/s. A car has one, its speed along its course. Another base has three: its speeds ahead and to

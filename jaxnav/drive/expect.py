@@ -8,7 +8,6 @@ tells the corners at any place, and before and after a motion.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -139,7 +138,9 @@ def likely_poses(
     return np.array([_wxyz_xyz(pose) for pose in poses], poses.dtype), covariances
 
 
-def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]:
+def quads_px(
+    navigator: Navigator, place: Place | Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "C M 4 2"]:
     """Corners as seen from a place, px, by the program that predicts search regions."""
     dtype = np.asarray(navigator.corner_sigma_px).dtype
     wxyz_xyz = np.array(_wxyz_xyz(place), dtype)
@@ -148,29 +149,23 @@ def quads_px(navigator: Navigator, place: Place) -> Float[np.ndarray, "C M 4 2"]
 
 
 def due_px(
-    navigator: Navigator, pose: Float[np.ndarray, " 3"] | None, motion: Place
-) -> tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]] | None:
-    """Corners before and after a motion, (C, M, 4, 2) each; None where the pose is not known.
+    navigator: Navigator, pose: Float[np.ndarray, " 3"], motion: Place
+) -> tuple[Float[np.ndarray, "C M 4 2"], Float[np.ndarray, "C M 4 2"]]:
+    """Corners before and after a motion, (C, M, 4, 2) each.
 
     Args:
         pose: estimated (x_m, y_m, psi_rad) after the motion. Its error matters little: the relative
             error of a shift is that of the distance to the marker.
         motion: (x_m, y_m, psi_rad) in the vehicle's axes before the motion.
     """
-    if pose is None:
-        return None
     x_m, y_m, psi_rad = map(float, pose)
-    before_rad = psi_rad - motion[2]
-    c, s = math.cos(before_rad), math.sin(before_rad)
-    before = (
-        x_m - c * motion[0] + s * motion[1],
-        y_m - s * motion[0] - c * motion[1],
-        before_rad,
-    )
-    return quads_px(navigator, before), quads_px(navigator, (x_m, y_m, psi_rad))
+    ahead_m, left_m, turn_rad = motion
+    c, s = math.cos(psi_rad - turn_rad), math.sin(psi_rad - turn_rad)
+    before = x_m - c * ahead_m + s * left_m, y_m - s * ahead_m - c * left_m, psi_rad - turn_rad
+    return quads_px(navigator, before), quads_px(navigator, pose)
 
 
-def _wxyz_xyz(place: Sequence[float]) -> list[float]:
+def _wxyz_xyz(place: Place | Float[np.ndarray, " 3"]) -> list[float]:
     x_m, y_m, psi_rad = map(float, place)
     return [math.cos(psi_rad / 2), 0, 0, math.sin(psi_rad / 2), x_m, y_m, 0]
 

@@ -76,8 +76,7 @@ class FrameIntake:
         detections = [_NONE] * len(self.newest_ns)
         stamps_ns: dict[int, int] = {}
         for frame in frames:
-            if frame.faults:
-                faults |= frame.faults
+            faults |= frame.faults
             stamps = self._stamps[frame.camera]
             jumps = stamps.jumps
             stamp_ns = stamps.take(frame.stamp_ns, now_ns)
@@ -95,14 +94,14 @@ class FrameIntake:
             if len(frame.detections):
                 detections[frame.camera], stamps_ns[frame.camera] = frame.detections, stamp_ns
         seen = observe(detections, self._markers)
-        if seen.unknown:
-            faults |= Fault.UNKNOWN_MARKER
-        if seen.duplicates:
-            faults |= Fault.DUPLICATE_MARKER
-        if seen.mirrored:
-            faults |= Fault.CORNERS_MIRRORED
-        if hide_nowhere(seen):
-            faults |= Fault.CORNERS_NOT_FINITE
+        for is_there, fault in (
+            (seen.unknown, Fault.UNKNOWN_MARKER),
+            (seen.duplicates, Fault.DUPLICATE_MARKER),
+            (seen.mirrored, Fault.CORNERS_MIRRORED),
+            (hide_nowhere(seen), Fault.CORNERS_NOT_FINITE),
+        ):
+            if is_there:
+                faults |= fault
         taken_ns, frozen_seen = self._leave_out_frozen(seen, stamps_ns, now_ns, frozen)
         if frozen_seen:
             faults |= Fault.FRAME_FROZEN

@@ -1,17 +1,9 @@
 """What a gyro has told of the last moments, and whether it contradicts wheels and corners.
 
-    faults = track.take(readings, now_ns)
-    track.mean_radps(begin_ns, end_ns)      # NaN: not known
-
 A filter goes from event to event, and an event that comes late makes two intervals of one: so it is
 told the mean rate of any interval, from rates at the gyro's own stamps, between which the rate is
 taken to change evenly. Where a reading is missing, saturated or no number nothing is told, and the
 filter goes on by wheels and corners.
-
-    votes.add_command(command, gap_s)   # with every cycle
-    votes.add_reading(now_ns, motion)   # with every reading of the odometer, believed or not
-    votes.add_fix(now_ns, psi_rad)      # with every pose that the corners have confirmed
-    votes.gyro_is_wrong
 
 Where the gyro and the wheels differ, the corners decide who is wrong, and where no marker is seen
 the command does. What differs beyond the errors of all of them is summed and slowly forgotten.

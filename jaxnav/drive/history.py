@@ -30,9 +30,11 @@ class EventData:
     visible: Bool[np.ndarray, "C M"] | None = None
     sigma_px: Float[np.ndarray, "C M 4"] | None = None  # positive
 
-    def hiding(self, hidden: Bool[np.ndarray, "C M"]) -> "EventData | None":
+    def hiding(self, hidden: Bool[np.ndarray, "#C #M"]) -> "EventData | None":
         """The data without these views of markers; None where that leaves no marker."""
         assert self.visible is not None
+        if not (self.visible & hidden).any():
+            return self
         visible = self.visible & ~hidden
         return replace(self, visible=visible) if visible.any() else None
 

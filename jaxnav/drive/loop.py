@@ -93,7 +93,6 @@ class Statistics:
     )
     counts: dict[str, Int[np.ndarray, " bins"]] = field(default_factory=dict)
     deadlines_missed: int = 0
-    handled: int = 0
 
     def add(self, name: str, duration_ms: float) -> None:
         """Count one duration."""
@@ -269,11 +268,9 @@ class Loop:
         end_s = time.perf_counter()
         kind = "odometry" if given.odometry else "frames" if given.frames else "tick"
         self.statistics.add(f"handle {kind}", (end_s - begin_s) * 1e3)
-        self.statistics.handled += 1
         if kind == "frames" and success:
-            self.statistics.add(
-                "frame to command", (self._now_ns() - given.frames[0].stamp_ns) / 1e6
-            )
+            age_ms = (self._now_ns() - given.frames[0].stamp_ns) / 1e6
+            self.statistics.add("frame to command", age_ms)
         self._outcome = outcome
         self._expectation.update(outcome.output, outcome.belief.bank, outcome.now_ns)
         for observer in self._observers:

@@ -64,19 +64,12 @@ class MarkerVotes:
         None where that leaves nothing.
         """
         assert data.visible is not None
-        in_view = data.visible.any(axis=0)
-        hidden = in_view & (self._times >= _OFTEN)
-        if in_view.sum() >= LEAST_MARKERS or not hidden.any():
-            return data
-        return data.hiding(np.broadcast_to(hidden, data.visible.shape))
+        can_vote = data.visible.any(axis=0).sum() >= LEAST_MARKERS
+        return data if can_vote else data.hiding(self._times[None] >= _OFTEN)
 
 
 class CameraVotes:
     """The votes against each camera in one drive.
-
-        votes.note_contradiction(stamp_ns)  # frames that the filter did not expect
-        if votes.open(stamp_ns):  # only then are the corners projected
-            votes.count(data, due_px, stamp_ns)
 
     A camera that was knocked is off by more than the filter learns of one: its frames, and those
     that it shares with others, fit no pose, and the filter would give up the right one. A vehicle
@@ -98,7 +91,7 @@ class CameraVotes:
         self._contradicted_ns = stamp_ns
 
     def open(self, stamp_ns: int) -> bool:
-        """Whether there is anything to vote on."""
+        """Whether there is anything to vote on: only then are corners projected for `count`."""
         return stamp_ns - self._contradicted_ns < _OPEN_NS or bool(self._outvoted.any())
 
     def count(self, data: EventData, due_px: Float[np.ndarray, "C M 4 2"], stamp_ns: int) -> None:
@@ -129,11 +122,7 @@ class CameraVotes:
 
     def remove_outvoted(self, data: EventData) -> EventData | None:
         """The data without these cameras; None where that leaves nothing."""
-        assert data.visible is not None
-        hidden = self._outvoted & data.visible.any(axis=1)
-        if not hidden.any():
-            return data
-        return data.hiding(np.broadcast_to(hidden[:, None], data.visible.shape))
+        return data.hiding(self._outvoted[:, None])
 
     @property
     def _outvoted(self) -> Bool[np.ndarray, " C"]:
@@ -231,7 +220,7 @@ class Twins:
             votes >= _LASTING or abs(stamp_ns - last_ns) < _TOGETHER_NS
             for votes, last_ns in zip(self._votes, self._last_ns, strict=True)
         ]
-        return data.hiding(np.broadcast_to(twins, visible.shape)) if any(twins) else data
+        return data.hiding(np.array(twins)[None])
 
     def place_m(self, camera: int, marker: int) -> list[float]:
         """Where a sighting has its marker; known while several cameras are in view."""

@@ -231,18 +231,11 @@ class Pilot:
         data, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
         if data is not None:
-            self._judge_cameras(data, stamp_ns)
-            data = self._camera_votes.remove_outvoted(data)
-        if data is not None:
-            # By an estimate that has agreed with a way a knocked camera is told from a copy.
-            judged = self._sure and self._support.ranges.agreed
-            data = self._twins.remove_twins(data, stamp_ns, self._standstill.way, judged)
+            data = self._without_outvoted(data, stamp_ns)
         if self._twins.seen(now_ns):
             faults |= Fault.DUPLICATE_MARKER
         if data is not None:
-            data = self._marker_votes.remove_outvoted(data)
-        if data is not None:
-            outcome = self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
+            outcome = self._fuse(data, stamp_ns, now_ns, faults)
         if given.odometry is not None:
             return self._odometry(self._corrections.correct_reading(given.odometry), now_ns, faults)
         return outcome if data is not None else self._tick(now_ns, faults)
@@ -285,13 +278,18 @@ class Pilot:
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
         self._standstill.add_believed(stamp_ns, now_ns, pace, motion)
         data = EventData(odometry=reading.values)
-        return self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
+        return self._fuse(data, stamp_ns, now_ns, faults)
 
     def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
         return self._fuse(None, now_ns, now_ns, faults, rejects)
 
     def _fuse(
-        self, data: EventData | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
+        self,
+        data: EventData | None,
+        stamp_ns: int,
+        now_ns: int,
+        faults: Fault,
+        rejects: Reject = _NO_REJECT,
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(data, stamp_ns, now_ns, elapsed_ns)
@@ -302,7 +300,8 @@ class Pilot:
             self._begin_anew("the estimate was no number")
         if fused.refused:
             rejects |= Reject.TOO_LATE
-        if data is not None and data.corners_px is not None and fused.refused:
+        seen = data if data is not None and data.corners_px is not None else None
+        if seen is not None and fused.refused:
             self._frames.forget_last()
         restarts = self._restarts_before + int(fused.belief.restarts)
         if finite and restarts > self._restarts:
@@ -314,10 +313,10 @@ class Pilot:
             self._actuation.forget_place()
             if self._turns is not None:
                 self._turns.forget()
-        if data is not None and data.corners_px is not None and not fused.refused:
-            self._marker_votes.count(data, np.asarray(fused.output.outvoted))
+        if seen is not None and not fused.refused:
+            self._marker_votes.count(seen, np.asarray(fused.output.outvoted))
             candidates = vars(fused.output)["candidates"]
-            self._add_place(data, stamp_ns, candidates)
+            self._add_place(seen, stamp_ns, candidates)
             rejects |= self._judge(known, fused.belief, candidates, stamp_ns, now_ns)
         doubts = self._support.faults
         if self._drives:
@@ -328,8 +327,8 @@ class Pilot:
             stale = self._age_s(self._turns.track.newest_ns, now_ns) > GYRO_STALE_S
             faults |= Fault.GYRO_STALE if stale else _NO_FAULT
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
-        faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
-        faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
+        faults |= Fault.MARKER_OUTVOTED if markers else _NO_FAULT
+        faults |= Fault.CAMERA_OUTVOTED if cameras else _NO_FAULT
         # A fix since then is by other ids.
         self._on_twins = self._twins.seen(now_ns) and (self._fix_ns or 0) < self._twins.last_ns
         placed = known.decided and self._support.confirmed and not self._on_twins
@@ -394,13 +393,11 @@ class Pilot:
         alive = zip(*planar_poses(bank), bank.initialised, strict=True)
         support = self._support
         before = support.relocations, support.refused
-        if support.add_corners(
-            known.accepted,
-            agrees,
-            now_ns,
-            fix,
-            lambda: [_fix(pose, covariance) for pose, covariance, lives in alive if lives],
-        ):
+
+        def possible() -> list[Fix]:
+            return [_fix(pose, covariance) for pose, covariance, lives in alive if lives]
+
+        if support.add_corners(known.accepted, agrees, now_ns, fix, possible):
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
         if support.relocations > before[0] or support.refused > before[1]:
             what = "refused" if support.refused else "relocated"
@@ -433,13 +430,17 @@ class Pilot:
         if self._support.ranges.add_place(self._lane, place_m, motion):
             self._look_ns = stamp_ns
 
-    def _judge_cameras(self, data: EventData, stamp_ns: int) -> None:
-        """Let a sure estimate vote on the cameras in view; see `CameraVotes`."""
-        known = self._known
-        if self._sure and known is not None and self._camera_votes.open(stamp_ns):
-            x_m, y_m, psi_rad = known.pose.tolist()
-            due_px = quads_px(self._unnamed, (x_m, y_m, psi_rad))
-            self._camera_votes.count(data, due_px, stamp_ns)
+    def _without_outvoted(self, data: EventData, stamp_ns: int) -> EventData | None:
+        """What is left of a frame without views that others contradict; None: nothing."""
+        known, votes = self._known, self._camera_votes
+        if self._sure and known is not None and votes.open(stamp_ns):
+            votes.count(data, quads_px(self._unnamed, known.pose), stamp_ns)
+        left = votes.remove_outvoted(data)
+        if left is not None:
+            # By an estimate that has agreed with a way a knocked camera is told from a copy.
+            judged = self._sure and self._support.ranges.agreed
+            left = self._twins.remove_twins(left, stamp_ns, self._standstill.way, judged)
+        return None if left is None else self._marker_votes.remove_outvoted(left)
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
@@ -494,9 +495,9 @@ class Pilot:
         return max(now_ns - stamp_ns, 0) / 1e9
 
     def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
-        """See `due_px`."""
+        """See `due_px`; None where the pose is not known."""
         known = self._known
-        return due_px(self._unnamed, known.pose if known and known.located else None, motion)
+        return due_px(self._unnamed, known.pose, motion) if known and known.located else None
 
     def _slept(self, now_ns: int) -> Fault:
         """Start anew if the loop paused for so long that its belief is out of date."""

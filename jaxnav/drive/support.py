@@ -1,11 +1,5 @@
 """Check what supports an estimate, and so decide whether to act on it.
 
-    # With each reading:
-    support.add_odometry(driven_mps, motion, heading_rad, gap_s, wanted_mps, seeing)
-    support.ranges.add_place(lane, place_m, motion)  # with every frame that shows markers
-    is_fix = support.add_corners(accepted, agrees, now_ns, fix, possible)  # with every frame
-    support.doubt(contradicted)
-
 The filter can't know that its pose is wrong: all data were fused into it. So a pose is trusted only
 after CONFIRMED frames in a row have fitted it, and only until corners, or odometer and throttle,
 contradict it. After a restart the pose is compared with the way of the wheels since the last fix: a

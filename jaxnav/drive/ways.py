@@ -1,10 +1,5 @@
 """Compare the vehicle's way by the corners with its way by the odometer.
 
-    ways.add_odometry(motion, pace_mps, heading_rad, gap_s)   # with every odometry
-    ways.note_corners(now_ns)                             # with every frame that shows markers
-    ways.add_fix(now_ns, fix)                             # with every pose to be trusted
-    ways.out_of_reach(fix)                                # before that
-
 A marker that is carried along, or a copy of it elsewhere, fits its own corners as well as the true
 one does. It can't imitate the odometer: the car has not gone where the corners say. There are two
 measures, since a slow drag is hidden by wheel slip and a leap is not:
@@ -15,10 +10,6 @@ measures, since a slow drag is hidden by wheel slip and a leap is not:
 
 Neither detects a copy carried slower than DRIFT_SHARE of the car's own speed or by less than the
 two margins, or one that was there from the beginning.
-
-    ranges.add_way(way_m)                                 # with every odometry
-    ranges.add_place(lane, place_m, motion)               # with every frame that shows markers
-    ranges.contradicted, ranges.lasting
 
 How fast a marker comes nearer needs no estimate: neither of a pose, nor of which of two it is. A
 marker or a focal length that is s times as large as its file says makes every range s times as

@@ -236,6 +236,11 @@ def _odometry_with(**changes):
     return change
 
 
+def repeated(*case):
+    """What another case shows as well: for `make test-all`."""
+    return pytest.param(*case, marks=pytest.mark.long)
+
+
 def _one_nan(corners_px: np.ndarray) -> np.ndarray:
     corners_px[:, 2, 1] = np.nan
     return corners_px
@@ -245,21 +250,23 @@ def _one_nan(corners_px: np.ndarray) -> np.ndarray:
     ("change", "fault", "reject"),
     [
         (_odometry_with(speed_mps=math.nan), Fault.ODOMETRY_INVALID, Reject(0)),
-        (_odometry_with(speed_mps=-math.inf), Fault.ODOMETRY_INVALID, Reject(0)),
-        (_odometry_with(steering_rad=math.nan), Fault.ODOMETRY_INVALID, Reject(0)),
+        repeated(_odometry_with(speed_mps=-math.inf), Fault.ODOMETRY_INVALID, Reject(0)),
+        repeated(_odometry_with(steering_rad=math.nan), Fault.ODOMETRY_INVALID, Reject(0)),
         (_odometry_with(valid=False), Fault.ODOMETRY_INVALID, Reject(0)),
         (_odometry_with(speed_mps=999.0), Fault(0), Reject.ODOMETRY),
         (_odometry_with(speed_mps=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
-        (_odometry_with(steering_rad=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
+        repeated(_odometry_with(steering_rad=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
         (_frame_with(corners_px=lambda c: c * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(corners_px=lambda c: c + math.inf), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        repeated(
+            _frame_with(corners_px=lambda c: c + math.inf), Fault.CORNERS_NOT_FINITE, Reject(0)
+        ),
         (_frame_with(corners_px=_one_nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(corners_px=lambda c: c * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        repeated(_frame_with(corners_px=lambda c: c * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=lambda c: c * 0), Fault.FRAME_FROZEN, Reject.INNOVATION),
         (_frame_with(sigma_px=lambda s: s * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(sigma_px=lambda s: s * 0), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(sigma_px=lambda s: s - 1), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        (_frame_with(sigma_px=lambda s: s * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        repeated(_frame_with(sigma_px=lambda s: s * 0), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        repeated(_frame_with(sigma_px=lambda s: s - 1), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        repeated(_frame_with(sigma_px=lambda s: s * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(sigma_px=lambda s: s * 1e-300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(ids=lambda i: i.astype(int) + 9), Fault.UNKNOWN_MARKER, Reject(0)),
     ],
@@ -307,11 +314,8 @@ def test_a_loop_that_slept_begins_anew(setup, inputs):
 
 def test_a_clock_of_the_odometer_that_jumped_is_told_once(setup, inputs):
     def ahead(part):
-        return (
-            dataclasses.replace(part, stamp_ns=part.stamp_ns + 5_000 * MS)
-            if isinstance(part, Odometry)
-            else part
-        )
+        by_ns = 5_000 * MS if isinstance(part, Odometry) else 0
+        return dataclasses.replace(part, stamp_ns=part.stamp_ns + by_ns)
 
     _, outcomes = handled(setup, [*inputs[:100], *(_changed(g, ahead) for g in inputs[100:])])
     faults = [outcome.faults for outcome in outcomes]
@@ -416,12 +420,8 @@ def test_what_nothing_confirms_is_not_decided_and_its_sigma_says_so(setup):
     """No marker, the throttle in, and an odometer that stands: blocked wheels, or a dead sensor."""
 
     def blind(given: Input) -> list[Input]:
-        still = dataclasses.replace(given, frames=())
-        if given.odometry is not None:
-            still = dataclasses.replace(
-                still, odometry=dataclasses.replace(given.odometry, speed_mps=0.0)
-            )
-        return [still]
+        blind = dataclasses.replace(given, frames=())
+        return [_changed(blind, _odometry_with(speed_mps=0.0))]
 
     steps = simulated(setup, 4.0, change=inject.between(1.5, np.inf, blind))
     last = steps[-1]
