@@ -31,7 +31,7 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import Vehicle, advance_bicycle
 from jaxnav.core.pose.observation import MODEL_SIGMA_PX
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.pilot import Outcome
 from jaxnav.files.executables import kept
 
@@ -134,7 +134,7 @@ class CameraDelays:
         data = outcome.data
         if data is not None and data.odometry is not None:
             self.add_reading(outcome.stamp_ns, *data.odometry)
-        if data is not None and data.corners_px is not None:
+        if isinstance(data, Sighting):
             self.add_corners(outcome.stamp_ns, data)
         output = outcome.output
         if outcome.now_ns >= self._next_ns and bool(output.decided):
@@ -145,11 +145,8 @@ class CameraDelays:
         if not self._readings or stamp_ns > self._readings[-1][0]:
             self._readings.append((stamp_ns, speed_mps, steering_rad))
 
-    def add_corners(self, stamp_ns: int, data: EventData) -> None:
+    def add_corners(self, stamp_ns: int, data: Sighting) -> None:
         """Keep corners and their corrected stamp."""
-        assert data.corners_px is not None
-        assert data.visible is not None
-        assert data.sigma_px is not None
         camera, marker = np.nonzero(data.visible)
         corners_px, sigma_px = data.corners_px[camera, marker], data.sigma_px[camera, marker]
         self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))

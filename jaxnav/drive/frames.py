@@ -10,7 +10,7 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.detection.observe import CornerLanes, observe
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.stamps import Stamps
 from jaxnav.files.ranges import is_within
 
@@ -63,7 +63,7 @@ class FrameIntake:
 
     def check(
         self, frames: Sequence[FrameDetections], now_ns: int, frozen: Frozen | None = None
-    ) -> tuple[EventData | None, int, Fault]:
+    ) -> tuple[Sighting | None, int, Fault]:
         """The data of frames, their stamp, and the faults found in them.
 
         Args:
@@ -109,7 +109,10 @@ class FrameIntake:
             return None, now_ns, faults
         if self._corner_sigma_px is not None:
             seen.sigma_px[seen.visible] = self._corner_sigma_px
-        return EventData(None, seen.corners_px, seen.visible, seen.sigma_px), taken_ns, faults
+        sighting = Sighting(
+            corners_px=seen.corners_px, visible=seen.visible, sigma_px=seen.sigma_px
+        )
+        return sighting, taken_ns, faults
 
     def _leave_out_frozen(
         self, seen: CornerLanes, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None

@@ -30,9 +30,17 @@ class EventData:
     visible: Bool[np.ndarray, "C M"] | None = None
     sigma_px: Float[np.ndarray, "C M 4"] | None = None  # positive
 
-    def hiding(self, hidden: Bool[np.ndarray, "#C #M"]) -> "EventData | None":
-        """The data without these views of markers; None where that leaves no marker."""
-        assert self.visible is not None
+
+@dataclass(frozen=True, kw_only=True)
+class Sighting(EventData):
+    """The corners of one frame or more that were captured together."""
+
+    corners_px: Float[np.ndarray, "C M 4 2"]
+    visible: Bool[np.ndarray, "C M"]
+    sigma_px: Float[np.ndarray, "C M 4"]
+
+    def hiding(self, hidden: Bool[np.ndarray, "#C #M"]) -> "Sighting | None":
+        """The sighting without these views of markers; None where that leaves no marker."""
         if not (self.visible & hidden).any():
             return self
         visible = self.visible & ~hidden

@@ -7,7 +7,6 @@ left_mps and turn_radps.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -117,11 +116,6 @@ def turns_by_twist(vehicle: Vehicle | TwistBase) -> TypeIs[TwistBase]:
 def limits_of(vehicle: Vehicle | TwistBase) -> CommandLimits:
     """The limits in a vehicle's description."""
     return TwistLimits.of(vehicle) if turns_by_twist(vehicle) else Limits.of(vehicle)
-
-
-def limits_from(numbers: Mapping[str, float]) -> CommandLimits:
-    """The limits of these fields, as another process has sent them."""
-    return TwistLimits(**numbers) if "turn_radps" in numbers else Limits(**numbers)
 
 
 def _clamped(value: float, limit: float, instead: float) -> float:

@@ -16,21 +16,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import fields
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from typing import Any
 
 from jaxnav.drive.corrections import Corrections
-from jaxnav.drive.guard_process import (
-    KIND_FAILED,
-    KIND_READING,
-    command_frame,
-    reading_from,
-    tell,
-    told,
-)
-from jaxnav.drive.interfaces import GyroReading, Setup
+from jaxnav.drive.interfaces import GyroReading, Setup, reading_of
 from jaxnav.drive.limits import CommandLimits
 from jaxnav.drive.priority import before_siblings
 from jaxnav.errors import BadInput
@@ -79,7 +71,7 @@ class GuardProcess:
                 end.close()
             raise
         self.commands, self.readings, self.spare = ours
-        tell(self.commands, **self._order)
+        self.commands.send(self._order)
 
     def prepare(self, check: Callable[[], None]) -> None:
         """Wait until the plug-in is imported there, or is known to stay here.
@@ -126,14 +118,14 @@ class GuardProcess:
                 "seed": setup.seed,
                 "options": dict(setup.options),
             },
-            "limits": asdict(limits),
-            "corrections": asdict(Corrections.of(setup.vehicle)),
+            "limits": limits,
+            "corrections": Corrections.of(setup.vehicle),
             "timeout_s": timeout_s,
             "resumes": resumes,
         }
         self._order |= changes
         self._opens = True
-        tell(self.commands, **changes)
+        self.commands.send(changes)
         answer = self._answer(check)
         if "bad" in answer:
             raise BadInput(*answer["bad"].split(": ", 1))
@@ -150,10 +142,10 @@ class GuardProcess:
             Why the vehicle has not heard the stop; None: it has.
         """
         order = self._order | {"only_stops": True}
-        with suppress(EOFError, OSError, ValueError):
-            tell(self.spare, **order)
+        with suppress(Exception):
+            self.spare.send(order)
             if self.spare.poll(_RECEIVES_S):
-                told(self.spare)
+                self.spare.recv()
                 return _unheard_by(self.spare)
             # It hangs as well: two that hold the vehicle may be one too many.
             if self.spare_pid:
@@ -164,7 +156,7 @@ class GuardProcess:
             return f"no other one can be started: {error.strerror or error}"
         try:
             return _unheard_by(another.commands)
-        except (EOFError, OSError, ValueError):
+        except Exception:
             return f"another one {ending(another.process)}"
         finally:
             another._opens = True  # it goes on until the vehicle hears it
@@ -183,7 +175,7 @@ class GuardProcess:
         while not self.commands.poll(_LOOK_S):
             check()
         try:
-            answer = told(self.commands)
+            answer: dict[str, Any] = self.commands.recv()
         except (EOFError, OSError):
             raise BadInput(
                 f"--car {self.name}", f"the guard's process {ending(self.process)}"
@@ -210,7 +202,6 @@ class MovedVehicle:
         self._timeout_ns = int((timeout_s - _LATEST_S) * 1e9)
         self.replaced: str | None = None
         self.unheard: str | None = None
-        self._sequence = 0
         self.over: str | None = None
         self._gyro: tuple[GyroReading, ...] = ()  # that came with readings, and were not asked for
         self._asked_s: float | None = None  # when the pending reading was requested
@@ -251,22 +242,21 @@ class MovedVehicle:
         """
         link = self._guarding.readings
         if self._asked_s is None:
-            link.send_bytes(b"?")
+            link.send("?")
             self._asked_s = time.monotonic()
         if not link.poll(_READ_S):
             raise OSError("no reading within a tick")
         try:
-            answer = link.recv_bytes()
+            answer = link.recv()
         except EOFError:
             raise OSError("the guard's process is gone") from None
         self._asked_s = None
-        if answer[:1] != KIND_READING:
-            assert answer[:1] == KIND_FAILED
-            raise OSError(answer[1:].decode(errors="replace"))
-        reading, gyro, over = reading_from(answer)
+        if isinstance(answer, str):
+            raise OSError(answer)
+        read, turns, over = answer
         self.over = over or None
-        self._gyro += gyro
-        return reading
+        self._gyro += tuple(GyroReading(*turn) for turn in turns)
+        return reading_of(*read)
 
     def read_gyro(self) -> tuple[GyroReading, ...]:
         """See `HasGyro`: what came with the readings since; nothing of a vehicle without one."""
@@ -281,10 +271,8 @@ class MovedVehicle:
         """
         if self._dead or self._closed:
             raise OSError(self._dead or "the vehicle is closed")
-        self._sequence += 1
         deadline_ns = time.monotonic_ns() + self._timeout_ns
-        frame = command_frame(self._sequence, deadline_ns, command)
-        self._guarding.commands.send_bytes(frame)
+        self._guarding.commands.send((deadline_ns, tuple(map(float, command))))
 
     def stop(self) -> None:
         """See `Vehicle`: the guard there trips, and repeats the stop until the vehicle hears it.
@@ -301,13 +289,13 @@ class MovedVehicle:
         if self._dead:
             raise OSError(self._dead)
         with suppress(OSError):  # the process is ending: `_listen` sees to it
-            tell(self._guarding.commands, stop="told to stop", late=self._late())
+            self._guarding.commands.send({"stop": "told to stop", "late": self._late()})
 
     def resume(self) -> bool:
         """See `Resuming`: a refusal is reported as another stop."""
         with suppress(OSError):
             if not (self._dead or self._closed):
-                tell(self._guarding.commands, resume=True)
+                self._guarding.commands.send({"resume": True})
                 self._stop_s = self._reason = None  # an answer is due to the next stop
                 return True
         return False
@@ -319,7 +307,7 @@ class MovedVehicle:
             self._close_s = time.monotonic()
             self._stop_s = self._stop_s or self._close_s
             with suppress(OSError):
-                tell(self._guarding.commands, close=True)
+                self._guarding.commands.send({"close": True})
             self._ended.wait()
             self._closed = True
         self._guarding.end()
@@ -349,7 +337,7 @@ class MovedVehicle:
                 looked_s = now_s
                 if news or due_s is None or due_s != due_before_s:
                     silent_s = 0.0
-                if news and self._closes(told(link)):
+                if news and self._closes(link.recv()):
                     return None
                 answers_s = _DEAF_S if self._stop_s is None else _ANSWERS_S
                 if silent_s > (_CLOSES_S if self._heard else answers_s):
@@ -359,12 +347,12 @@ class MovedVehicle:
                         return "the guard's process did not end"
                     self.unheard = f"{self.unheard}; the guard's process still tells it to stop"
                     return None
-        except ValueError:
-            return "the guard's process sent what is no event"
         except (EOFError, OSError):
             with suppress(subprocess.TimeoutExpired):
                 process.wait(1.0)
             return f"the guard's process {ending(process)}"
+        except Exception:  # whatever it is, nothing that it says can be relied on any more
+            return "the guard's process sent what is no event"
 
     def _due_s(self) -> float | None:
         """Since when an answer is due: to the first stop, or to a request for a reading."""
@@ -408,7 +396,7 @@ def _unheard_by(link: Connection) -> str | None:
     """
     why, end_s = "no other one has opened it yet", time.monotonic() + _CLOSES_S
     while link.poll(max(end_s - time.monotonic(), 0.0)):
-        said = told(link)
+        said = link.recv()
         if said.get("heard") or ("closed" in said and said["unheard"] is None):
             return None
         why = said.get("unheard") or said.get("bad") or said.get("stays") or why

@@ -12,7 +12,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.candidates import LEAST_MARKERS
 from jaxnav.core.pose.ippe import ippe_from_rays
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.standstill import Way, between
 from jaxnav.files.executables import kept
 
@@ -41,13 +41,12 @@ class MarkerVotes:
         self._ids = ids
         self._times = np.zeros(len(ids), int)
 
-    def count(self, data: EventData, outvoted: Bool[np.ndarray, " M"]) -> None:
+    def count(self, data: Sighting, outvoted: Bool[np.ndarray, " M"]) -> None:
         """Count the votes of a frame.
 
         Args:
             outvoted: (M,), which markers the filter found to be outvoted.
         """
-        assert data.visible is not None
         in_view = data.visible.any(axis=0)
         if in_view.sum() >= LEAST_MARKERS:
             times = self._times + np.where(outvoted, 1, -1) * in_view
@@ -58,12 +57,11 @@ class MarkerVotes:
         """The ids of the markers that have more votes against them than for them."""
         return tuple(self._ids[index] for index in np.flatnonzero(self._times))
 
-    def remove_outvoted(self, data: EventData) -> EventData | None:
+    def remove_outvoted(self, data: Sighting) -> Sighting | None:
         """The data without markers that were often outvoted, if too few are in view to vote.
 
         None where that leaves nothing.
         """
-        assert data.visible is not None
         can_vote = data.visible.any(axis=0).sum() >= LEAST_MARKERS
         return data if can_vote else data.hiding(self._times[None] >= _OFTEN)
 
@@ -94,17 +92,14 @@ class CameraVotes:
         """Whether there is anything to vote on: only then are corners projected for `count`."""
         return stamp_ns - self._contradicted_ns < _OPEN_NS or bool(self._outvoted.any())
 
-    def count(self, data: EventData, due_px: Float[np.ndarray, "C M 4 2"], stamp_ns: int) -> None:
+    def count(self, data: Sighting, due_px: Float[np.ndarray, "C M 4 2"], stamp_ns: int) -> None:
         """Count the votes of a frame.
 
         Args:
-            data: with corners.
             due_px: where they should be by the estimate.
         """
-        corners_px, visible = data.corners_px, data.visible
-        assert corners_px is not None
-        assert visible is not None
-        apart_px = np.linalg.norm(corners_px - due_px, axis=3).max(axis=2)
+        visible = data.visible
+        apart_px = np.linalg.norm(data.corners_px - due_px, axis=3).max(axis=2)
         off_px = np.where(visible, apart_px, 0).max(axis=1)
         in_view, off = visible.any(axis=1), ~(off_px <= self._most_px)
         self._off_px[off], self._off_ns[off] = off_px[off], stamp_ns
@@ -120,7 +115,7 @@ class CameraVotes:
         """The names of the cameras without a vote."""
         return tuple(self._names[self._outvoted].tolist())
 
-    def remove_outvoted(self, data: EventData) -> EventData | None:
+    def remove_outvoted(self, data: Sighting) -> Sighting | None:
         """The data without these cameras; None where that leaves nothing."""
         return data.hiding(self._outvoted[:, None])
 
@@ -186,20 +181,17 @@ class Twins:
         return max(self._last_ns)
 
     def remove_twins(
-        self, data: EventData, stamp_ns: int, way: Way, judged: bool = False
-    ) -> EventData | None:
+        self, data: Sighting, stamp_ns: int, way: Way, judged: bool = False
+    ) -> Sighting | None:
         """The data without ids at contradicting places; None where that leaves nothing.
 
         Args:
             way: of the vehicle by its odometer, which has moved between looks.
             judged: a sure estimate judges contradictions.
         """
-        assert data.corners_px is not None
-        assert data.visible is not None
         visible = data.visible
         if len(visible) < 2:
             return data
-        assert data.sigma_px is not None
         lanes = np.argwhere(visible).tolist()
         for camera, marker in lanes:
             self._corners_px[camera, marker] = data.corners_px[camera, marker]

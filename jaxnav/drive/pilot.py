@@ -33,7 +33,7 @@ from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections, FrameIntake
 from jaxnav.drive.gyro import TurnVotes
 from jaxnav.drive.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import EventData, Sighting
 from jaxnav.drive.interfaces import GyroReading, Reading
 from jaxnav.drive.limits import Command
 from jaxnav.drive.odometer import Odometers
@@ -300,7 +300,7 @@ class Pilot:
             self._begin_anew("the estimate was no number")
         if fused.refused:
             rejects |= Reject.TOO_LATE
-        seen = data if data is not None and data.corners_px is not None else None
+        seen = data if isinstance(data, Sighting) else None
         if seen is not None and fused.refused:
             self._frames.forget_last()
         restarts = self._restarts_before + int(fused.belief.restarts)
@@ -407,9 +407,8 @@ class Pilot:
             return Reject.INNOVATION
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
 
-    def _add_place(self, data: EventData, stamp_ns: int, candidates: Candidates) -> None:
+    def _add_place(self, data: Sighting, stamp_ns: int, candidates: Candidates) -> None:
         """Watch how the range of a marker in view changes; see `Ranges`."""
-        assert data.visible is not None
         valid = np.asarray(candidates.valid)
         best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
         then_ns, way = self._look_ns, self._standstill.way
@@ -430,7 +429,7 @@ class Pilot:
         if self._support.ranges.add_place(self._lane, place_m, motion):
             self._look_ns = stamp_ns
 
-    def _without_outvoted(self, data: EventData, stamp_ns: int) -> EventData | None:
+    def _without_outvoted(self, data: Sighting, stamp_ns: int) -> Sighting | None:
         """What is left of a frame without views that others contradict; None: nothing."""
         known, votes = self._known, self._camera_votes
         if self._sure and known is not None and votes.open(stamp_ns):

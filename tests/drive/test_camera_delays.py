@@ -19,7 +19,7 @@ from jaxnav.detection import Detections
 from jaxnav.drive.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections, FrameIntake
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import EventData, Sighting
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.sim.corners import see
@@ -209,7 +209,8 @@ def test_stretches_that_contradict_each_other_widen_sigma():
 
 def test_nothing_grows_however_long_it_drives():
     delays = CameraDelays(RIG, MARKERS, VEHICLE)
-    told = EventData(None, np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool), np.ones((4, 1, 4)))
+    corners_px, visible = np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool)
+    told = Sighting(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
     for count in range(5000):
         delays.add_reading(count * 10**7, 0.1, 0.0)
         delays.add_corners(count * 10**7, told)

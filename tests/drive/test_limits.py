@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.core.models.vehicle import TwistBase
-from jaxnav.drive.limits import Limits, TwistLimits, limits_from, limits_of
+from jaxnav.drive.limits import Limits, TwistLimits, limits_of
 from tests import worlds
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
@@ -60,4 +60,3 @@ def test_any_twist_is_cut_at_each_limit_and_one_that_is_no_number_is_zero(comman
 def test_the_limits_of_a_base_are_the_files():
     base = TwistBase.create(1.2, 3.0, 0.1, left_limit_mps=0.7)
     assert limits_of(base) == TwistLimits(*map(float, (base.limits)))
-    assert limits_from({"forward_mps": 1.0, "left_mps": 0.5, "turn_radps": 3.0}) == BASE

@@ -274,9 +274,7 @@ def test_without_that_word_the_drive_is_over(well):
     with held(well, resumes=False) as drive:
         drive.thread.join(5)
         assert " hangs for " in drive.ended
-        assert drive.loop.stopped
-        assert drive.loop.late
-        assert drive.said == []
+        assert (drive.loop.stopped, drive.loop.late, drive.said) == (True, True, [])
 
 
 @pytest.mark.parametrize("after_s", [0.0, 1.0])
@@ -285,9 +283,8 @@ def test_a_signal_ends_a_drive_that_is_held(well, after_s):
         time.sleep(after_s)
         drive.guard.trip("SIGINT")
         drive.thread.join(5)
-        assert drive.ended == "SIGINT"
-        assert drive.loop.stopped
-        assert not drive.loop.late
+        loop = drive.loop
+        assert (drive.ended, loop.stopped, loop.late) == ("SIGINT", True, False)
 
 
 def test_a_vehicle_that_is_not_well_or_has_no_number_does_not_resume(well):
@@ -351,8 +348,7 @@ def test_it_ends_in_good_order_when_the_vehicle_has_nothing_more_to_drive(standi
     with Drive(standing) as drive:
         drive.car.over = "the tape is over"
         drive.thread.join(1)
-        assert drive.ended == "the tape is over"
-        assert not drive.loop.stopped
+        assert (drive.ended, drive.loop.stopped) == ("the tape is over", False)
 
 
 class Onlooker:
@@ -398,8 +394,7 @@ def test_a_drive_that_the_guard_ends_was_stopped(standing):
     with Drive(standing) as drive:
         drive.guard.trip("enough")
         drive.thread.join(1)
-        assert drive.ended == "enough"
-        assert drive.loop.stopped
+        assert (drive.ended, drive.loop.stopped) == ("enough", True)
 
 
 class Backlog:
@@ -485,28 +480,17 @@ def test_a_loop_that_is_too_slow_gets_the_newest_frame_of_each_camera():
         guard.close()
 
 
-@pytest.mark.parametrize(
-    "image",
-    [
-        None,
-        np.zeros((410, 820), np.uint8),
-        np.full((410, 820, 3), 255, np.uint8),
-        np.zeros((410, 820), np.float32),
-        np.zeros((820, 410), np.uint8),
-        np.zeros((410, 820, 4), np.uint8),
-        np.zeros((0, 0), np.uint8),
-        "no image",
-    ],
-)
-def test_an_image_that_can_not_be_used_is_said_to_be_so(image):
-    assert image_fault(image, (820, 410)) == Fault.FRAME_UNUSABLE
-
-
-def test_noise_and_half_an_image_are_looked_at():
+def test_an_image_that_can_not_be_used_is_said_to_be_so():
+    """One without contrast, type, size or channels; noise and half an image are looked at."""
     noise = np.random.default_rng(0).integers(0, 256, (410, 820), dtype=np.uint8)
+    flat = [noise * 0, np.full((410, 820, 3), 255, np.uint8)]
+    shapes = [noise.T, noise[..., None], np.dstack([noise] * 4), noise[0], noise[:0, :0]]
+    for image in (None, "no image", noise.astype(np.float32), *flat, *shapes):
+        assert image_fault(image, (820, 410)) == Fault.FRAME_UNUSABLE
     half = noise.copy()
     half[:, 410:] = 0
-    assert image_fault(noise, (820, 410)) == image_fault(half, (820, 410)) == Fault(0)
+    for image in (noise, half, np.dstack([noise] * 3)):
+        assert image_fault(image, (820, 410)) == Fault(0)
 
 
 class Finder:

@@ -10,7 +10,7 @@ import pytest
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.drive.chassis import Motion
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.outvoted import CameraVotes, MarkerVotes, Twins
 from jaxnav.drive.standstill import Way
 from tests import worlds
@@ -18,10 +18,10 @@ from tests import worlds
 IDS = (7, 3, 12)
 
 
-def told(*in_view: int, count: int = len(IDS)) -> EventData:
+def told(*in_view: int, count: int = len(IDS)) -> Sighting:
     visible = np.zeros((2, count), bool)
     visible[0, list(in_view)] = True
-    return EventData(
+    return Sighting(
         corners_px=np.zeros((2, count, 4, 2)), visible=visible, sigma_px=np.ones((2, count, 4))
     )
 
@@ -90,7 +90,7 @@ def twins(rig=RIG) -> Twins:
     return Twins(navigator(rig))
 
 
-def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int = 0) -> EventData:
+def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int = 0) -> Sighting:
     """What the cameras see from (x_m, y_m, psi_rad), some of them of the copy alone."""
     rng, T = np.random.default_rng(seed), worlds.planar(*place)
     truth, copy = worlds.observe(RIG, MARKERS, T), worlds.observe(RIG, MARKERS, ELSEWHERE @ T)
@@ -99,7 +99,7 @@ def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int 
     visible = visible & np.isin(np.arange(4), list(cameras))[:, None]
     corners_px = np.where(of_copy[:, :, None, None], copy.corners_px, truth.corners_px)
     corners_px = corners_px + noise_px * rng.standard_normal(corners_px.shape)
-    return EventData(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
+    return Sighting(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
 
 
 def standing(until_ns: int) -> Way:
@@ -200,12 +200,12 @@ def votes():
     return CameraVotes(navigator())
 
 
-def off(off_deg: dict[int, float]) -> EventData:
+def off(off_deg: dict[int, float]) -> Sighting:
     """What the cameras in view see, each of them off by an angle."""
     visible = np.isin(np.arange(4), list(off_deg))[:, None]
     angles = np.array([off_deg.get(camera, 0.0) for camera in range(4)])
     shift_px = FOCAL_PX * np.tan(np.deg2rad(angles))
-    return EventData(
+    return Sighting(
         corners_px=DUE_PX + shift_px[:, None, None, None] * np.array([1.0, 0.0]),
         visible=visible,
         sigma_px=np.ones((4, 1, 4)),
