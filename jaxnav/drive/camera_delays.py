@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.core.models.markers import MarkerMap
@@ -104,13 +104,13 @@ class _Stretch(NamedTuple):
 
 
 class _View(NamedTuple):
-    """The markers seen at one instant, one row each."""
+    """One marker in one camera's frame."""
 
     stamp_ns: int
-    camera: Int[np.ndarray, " N"]
-    marker: Int[np.ndarray, " N"]
-    corners_px: Float[np.ndarray, "N 4 2"]
-    sigma_px: Float[np.ndarray, "N 4"]
+    camera: int
+    marker: int
+    corners_px: Float[np.ndarray, "4 2"]
+    sigma_px: Float[np.ndarray, " 4"]
 
 
 class CameraDelays:
@@ -120,9 +120,9 @@ class CameraDelays:
         """Take the drive's rig, map and vehicle. Delays come beside the vehicle's corrections."""
         self._world = rig, markers.without_names(), vehicle.wheelbase_m
         self._dtype = np.asarray(vehicle.wheelbase_m).dtype
-        # Bounded memory: half a minute at 30 Hz, and a third of a minute at 50 Hz.
+        # Bounded memory: 20 s of readings at 50 Hz, 270 s of one marker at 30 Hz.
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=1024)
-        self._views: deque[_View] = deque(maxlen=1024)
+        self._views: deque[_View] = deque(maxlen=8192)
         self._open: deque[tuple[int, np.ndarray]] = deque(maxlen=_WAITING)  # begin, pose there
         self._next_ns = 0
         # For every camera: sums of information, information * delay, information * delay^2.
@@ -147,9 +147,10 @@ class CameraDelays:
 
     def add_corners(self, stamp_ns: int, data: Sighting) -> None:
         """Keep corners and their corrected stamp."""
-        camera, marker = np.nonzero(data.visible)
-        corners_px, sigma_px = data.corners_px[camera, marker], data.sigma_px[camera, marker]
-        self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
+        corners_px, sigma_px = data.corners_px[data.visible], data.sigma_px[data.visible]
+        lanes = np.argwhere(data.visible).tolist()
+        for (camera, marker), *seen in zip(lanes, corners_px, sigma_px, strict=True):
+            self._views.append(_View(stamp_ns, camera, marker, *seen))
 
     def add_pose(self, now_ns: int, pose: Float[np.ndarray, " 3"]) -> None:
         """Begin a stretch at the car's approximate pose, if it is time for one."""
@@ -167,7 +168,7 @@ class CameraDelays:
 
     def warm_up(self) -> None:
         """Compile the program, or load it."""
-        one = _View(10**9, np.zeros(1, int), np.zeros(1, int), np.zeros((1, 4, 2)), np.ones((1, 4)))
+        one = _View(10**9, 0, 0, np.zeros((4, 2)), np.ones(4))
         readings = [(k * 10**8, 0.1, 0.0) for k in range(30)]
         self._equations(_stretch(0, 0, readings, [one], self._dtype), 0 * _PRIOR)
 
@@ -183,12 +184,8 @@ class CameraDelays:
         if not moved or len(readings) < 3:
             return
         for camera in range(len(self._counts)):
-            among = [
-                _View(view.stamp_ns, *(column[which] for column in view[1:]))
-                for view in views
-                if (which := view.camera == camera).any()
-            ]
-            if len(among) < _LEAST_VIEWS:
+            among = [view for view in views if view.camera == camera]
+            if len({view.stamp_ns for view in among}) < _LEAST_VIEWS:
                 continue
             stretch = _stretch(camera, begin_ns, readings, among, self._dtype)
             delay_s, information = self._solved(stretch, pose)
@@ -262,9 +259,7 @@ def _stretch(
 ) -> _Stretch:
     """A stretch in arrays of fixed size; a reading holds from midway after the one before."""
     readings = _thinned(readings, _READINGS)
-    # One row for each marker at each instant.
-    rows = [(view.stamp_ns, *row) for view in views for row in zip(*view[2:], strict=True)]
-    stamps_ns, marker, corners_px, sigmas_px = zip(*_thinned(rows, _VIEWS), strict=True)
+    stamps_ns, _, marker, corners_px, sigmas_px = zip(*_thinned(views, _VIEWS), strict=True)
     stamps_s = np.array([(stamp_ns - begin_ns) / 1e9 for stamp_ns, _, _ in readings])
     edges_s = np.concatenate([stamps_s[:1], (stamps_s[1:] + stamps_s[:-1]) / 2])
     rest, more = _READINGS - len(readings), _VIEWS - len(stamps_ns)
@@ -296,11 +291,7 @@ def _thinned(rows: Sequence[Any], most: int) -> list[Any]:
 
 @kept
 def _normal(
-    rig: CameraRig,
-    markers: MarkerMap,
-    wheelbase_m: Array,
-    stretch: _Stretch,
-    p: Array,
+    rig: CameraRig, markers: MarkerMap, wheelbase_m: Array, stretch: _Stretch, p: Array
 ) -> tuple[Array, Array, Array]:
     """Normal equations of the views' whitened residuals, and their chi-square, at `_PRIOR`'s p."""
     camera, edges_s, speed_mps, steering_rad, times_s, marker, corners_px, sigma_px, used = stretch

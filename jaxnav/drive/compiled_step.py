@@ -70,11 +70,7 @@ def strip_static(navigator: Navigator) -> Navigator:
         if not isinstance(part, Vehicle):
             return part
         return replace(
-            part,
-            speed_scale=1.0,
-            steering_gain=1.0,
-            steering_offset_rad=0.0,
-            camera_delay_s=0.0,
+            part, speed_scale=1.0, steering_gain=1.0, steering_offset_rad=0.0, camera_delay_s=0.0
         )
 
     return jax.tree.map(

@@ -29,11 +29,7 @@ MeanRate = Callable[[int, int], float]  # of the interval between two times, ns
 
 
 def advance_packed(
-    navigator: Navigator,
-    belief: Packed,
-    control: Packed,
-    events: Packed,
-    numbers: Int[Array, "4"],
+    navigator: Navigator, belief: Packed, control: Packed, events: Packed, numbers: Int[Array, "4"]
 ) -> tuple[Packed, Packed, Packed, Packed]:
     """`advance` with its arguments and results packed into a few vectors.
 

@@ -117,7 +117,8 @@ def main(commands: int, readings: int | None, spare: int | None = None) -> None:
         try:
             link.send({"opened": float(vehicle.timeout_s), "priority": priority})
             if readings is not None and not only_stops:
-                _Server(vehicle, guard, link, Connection(readings), wakeup[0]).serve()
+                asked = Connection(readings)  # which stays open until the vehicle is released
+                _Server(vehicle, guard, link, asked, wakeup[0]).serve()
         finally:
             guard.close(HEARD_WITHIN_S)
             with suppress(OSError):
@@ -128,12 +129,7 @@ class _Server:
     """The server of both sockets, until it is told to close."""
 
     def __init__(
-        self,
-        vehicle: AnyVehicle,
-        guard: Guard,
-        link: Connection,
-        asked: Connection,
-        signals: int,
+        self, vehicle: AnyVehicle, guard: Guard, link: Connection, asked: Connection, signals: int
     ):
         self._vehicle, self._guard = vehicle, guard
         self._link, self._asked, self._signals = link, asked, signals

@@ -79,9 +79,7 @@ class TwistLimits:
     def of(base: TwistBase) -> TwistLimits:
         """The limits in a base's description."""
         return TwistLimits(
-            float(base.forward_limit_mps),
-            float(base.left_limit_mps),
-            float(base.turn_limit_radps),
+            float(base.forward_limit_mps), float(base.left_limit_mps), float(base.turn_limit_radps)
         )
 
     @property

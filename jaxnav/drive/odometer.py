@@ -161,11 +161,7 @@ class Odometer:
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
 
     def _stuck(
-        self,
-        speed_mps: float,
-        values: tuple[float, ...],
-        stamp_ns: int,
-        wanted_mps: float | None,
+        self, speed_mps: float, values: tuple[float, ...], stamp_ns: int, wanted_mps: float | None
     ) -> bool:
         """Whether readings repeat too often: all of it, or only the speed although the command has
         changed it meanwhile (a driver without a steering sensor reports the commanded angle)."""

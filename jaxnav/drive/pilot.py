@@ -445,12 +445,12 @@ class Pilot:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
         disobeyed = self._drives and bool(self._actuation.faults)
         contradicted = self._monitor.contradicted or disobeyed or self._on_twins
-        doubt = self._support.doubt(contradicted)
-        if not (doubt.is_doubted and known.decided):
+        doubt_m = self._support.doubt_m(contradicted)
+        if doubt_m is None or not known.decided:
             return output, known
         covariances = [np.array(output.pose_covariance), np.array(output.covariance)]
         for covariance in covariances:
-            covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
+            covariance[[0, 1], [0, 1]] += doubt_m**2 / 2
         honest: Output = eqx.tree_at(
             lambda output: (output.decided, output.pose_covariance, output.covariance),
             output,

@@ -181,11 +181,7 @@ class Eyes:
     """The cameras of a rig, with the threads that read and search them."""
 
     def __init__(
-        self,
-        cameras: Sequence[Camera],
-        searches: Sequence[Search],
-        guard: Guard,
-        workers: int = 2,
+        self, cameras: Sequence[Camera], searches: Sequence[Search], guard: Guard, workers: int = 2
     ):
         """Args:
         searches: one for each camera.

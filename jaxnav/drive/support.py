@@ -7,7 +7,6 @@ copy of the marker elsewhere looks like the marker.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from jaxnav.drive.actuation import Propulsion
 from jaxnav.drive.chassis import Chassis, Motion, pace_mps
@@ -21,13 +20,6 @@ SLOW_M = 1.0
 # Every further restart on that way needs twice as many frames, up to three seconds of a camera's.
 _MOST_CONFIRMED = 96
 _NO_FAULT = Fault(0)
-
-
-class Doubt(NamedTuple):
-    """Whether to doubt an estimate, and its possible error beside its sigma."""
-
-    is_doubted: bool
-    off_m: float
 
 
 class Support:
@@ -156,8 +148,8 @@ class Support:
         self._ways.add_fix(now_ns, fix)
         return True
 
-    def doubt(self, contradicted: bool) -> Doubt:
-        """The doubt about the estimate.
+    def doubt_m(self, contradicted: bool) -> float | None:
+        """By how much the estimate may be off beside its sigma; None: it is not doubted.
 
         Args:
             contradicted: the corners contradict it more often than not.
@@ -168,7 +160,7 @@ class Support:
             off_m += self._ways.since_fix_m
         contradicted |= self.ranges.contradicted
         is_doubted = not self.confirmed or self.refused or contradicted or doubtful
-        return Doubt(is_doubted, off_m)
+        return off_m if is_doubted else None
 
     @property
     def _doubtful(self) -> bool:

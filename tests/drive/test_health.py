@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.drive.flags import Fault, Health, Reject, names
-from jaxnav.drive.health import (
-    LOOKS,
-    MOST_RESTARTS,
-    SPEED_FACTOR,
-    Monitor,
-    Senses,
-    Timeouts,
-)
+from jaxnav.drive.health import LOOKS, MOST_RESTARTS, SPEED_FACTOR, Monitor, Senses, Timeouts
 
 WELL = Senses(
     located=True,

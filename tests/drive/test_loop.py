@@ -9,7 +9,6 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from jaxnav.core.navigator import Navigator
 from jaxnav.detection import Tracker, make_detector
 from jaxnav.detection.signs_of_life import sign
 from jaxnav.detection.types import Detections
@@ -20,11 +19,12 @@ from jaxnav.drive.guard import TIMEOUT_S, Guard
 from jaxnav.drive.interfaces import MOST_TURNS, Frame, GyroReading, Odometry
 from jaxnav.drive.limits import limits_of
 from jaxnav.drive.loop import Loop
-from jaxnav.drive.pilot import Input, Pilot
+from jaxnav.drive.pilot import Input
 from jaxnav.drive.seeing import Eyes, Search, SearchedFrame, group_frames, image_fault
 from jaxnav.drive.standing_clock import STANDS_S, StandingClock
 from tests import worlds
 from tests.helpers.other_pictures import other_pictures
+from tests.helpers.simulated import make_setup
 
 SLACK_S = 0.3  # of a machine that does something else
 NONE = Detections.concatenate([])
@@ -102,14 +102,7 @@ class Throttle:
 
 @pytest.fixture(scope="module")
 def standing() -> Throttle:
-    pilot = Pilot(
-        Navigator(
-            rig=worlds.qcar_rig(),
-            markers=worlds.paper_markers(),
-            vehicle=worlds.qcar(),
-            waypoints_m=worlds.WAYPOINTS_M,
-        )
-    )
+    pilot = make_setup().pilot(None)  # whose program other modules use too
     throttle = Throttle(pilot)
     throttle.outcome = pilot.handle(Input(1_000_000_000))
     return throttle

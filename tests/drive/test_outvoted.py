@@ -161,7 +161,7 @@ def test_cameras_that_look_in_turn_are_compared_along_the_way():
     assert watch.remove_twins(second, 200 * MS, Way()) is second
 
 
-@pytest.mark.parametrize("noise_px", [0.3, 2.0])
+@pytest.mark.parametrize("noise_px", [pytest.param(0.3, marks=pytest.mark.long), 2.0])
 def test_what_calibration_and_noise_allow_is_one_place(noise_px):
     """Cameras off by 1 deg and 1 cm, and each of them by 8 deg, wherever two see the marker."""
     rng, seen = np.random.default_rng(0), 0

@@ -45,7 +45,7 @@ class Seeing:
 def test_no_single_frame_confirms():
     seeing = Seeing()
     assert seeing.frames(CONFIRMED) == [False] * (CONFIRMED - 1) + [True]
-    assert not seeing.support.doubt(contradicted=False).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is None
 
 
 def test_frames_that_contradict_each_other_never_confirm():
@@ -53,7 +53,7 @@ def test_frames_that_contradict_each_other_never_confirm():
     for _ in range(100):
         assert not any(seeing.frames(CONFIRMED - 1))
         seeing.frames(1, believed=False)
-        assert seeing.support.doubt(contradicted=False).is_doubted
+        assert seeing.support.doubt_m(contradicted=False) is not None
 
 
 def test_one_contradiction_takes_nothing_away_and_many_do():
@@ -61,15 +61,15 @@ def test_one_contradiction_takes_nothing_away_and_many_do():
     seeing.frames(10)
     seeing.frames(1, believed=False)
     assert seeing.frames(1) == [True]
-    assert not seeing.support.doubt(contradicted=False).is_doubted
-    assert seeing.support.doubt(contradicted=True).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is None
+    assert seeing.support.doubt_m(contradicted=True) is not None
 
 
 def test_what_the_filter_accepts_beyond_its_gate_is_a_fix_and_confirms_nothing():
     """A car that is being located is not stopped for want of a fix; nor does it start on that."""
     seeing = Seeing()
     assert not any(seeing.frames(20, agrees=False))
-    assert seeing.support.doubt(contradicted=False).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is not None
     seeing.frames(CONFIRMED)
     assert seeing.frames(20, agrees=False) == [True] * 20
     seeing.support.note_restart()
@@ -112,7 +112,7 @@ def test_who_must_not_relocate_refuses_and_goes_on_where_it_was():
     assert not any(seeing.frames(30, AWAY))
     assert seeing.support.refused
     assert seeing.support.relocated
-    assert seeing.support.doubt(contradicted=False).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is not None
     assert seeing.frames(1, HERE) == [True]
     assert not seeing.support.refused
     assert not seeing.support.relocated
