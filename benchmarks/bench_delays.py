@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.drive.camera_delays import CameraDelays
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.files import calib_dir, load_markers, load_rig, load_vehicle
 from jaxnav.sim.corners import see
 from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
@@ -128,7 +128,8 @@ def driven(kind: Kind, track: np.ndarray, delays: CameraDelays, world: Any, seed
     frame = 0
     for when_s, reading, pose in zip(readings_s, read, poses, strict=True):
         while frame < len(frames_s) and frames_s[frame] + 0.03 <= when_s:
-            seen = EventData(None, corners_px[frame], visible[frame], sigma_px)
+            told = {"corners_px": corners_px[frame], "visible": visible[frame]}
+            seen = Sighting(**told, sigma_px=sigma_px)
             if visible[frame].any():
                 delays.add_corners(_ns(frames_s[frame]), seen)
             frame += 1

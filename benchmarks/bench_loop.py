@@ -30,11 +30,11 @@ import pytest  # noqa: E402
 
 from jaxnav.commands.simulate.rendered_world import SENSOR  # noqa: E402
 from jaxnav.detection import make_detector  # noqa: E402
-from jaxnav.drive.expect import expect_corners  # noqa: E402
+from jaxnav.drive.expect import Region, expect_corners  # noqa: E402
 from jaxnav.drive.flags import Health  # noqa: E402
 from jaxnav.drive.interfaces import Frame  # noqa: E402
 from jaxnav.drive.pilot import Input  # noqa: E402
-from jaxnav.drive.seeing import Region, Search  # noqa: E402
+from jaxnav.drive.seeing import Search  # noqa: E402
 from jaxnav.files import Route, calib_dir, load_markers, load_rig, load_vehicle  # noqa: E402
 from jaxnav.recordings.drive_log import read_drive  # noqa: E402
 from jaxnav.recordings.drive_setup import DriveSetup  # noqa: E402

@@ -1,10 +1,5 @@
 """Compare the vehicle's motion by the corners with what it was commanded to do.
 
-    actuation.add_command(command, gap_s)     # with every cycle
-    actuation.add_fix(now_ns, fix)            # with every pose that the corners have confirmed
-    actuation.add_headings(now_ns, headings)  # with all others
-    actuation.faults, actuation.gives_up
-
 Each part of a command, the throttle and the steering of a car or the three of a twist, makes a
 motion due that lies between two bounds: its gain is right to a factor, and it may lag. What the
 corners show beyond the bounds is summed and slowly forgotten, so that neither a late servo nor
@@ -22,7 +17,6 @@ from dataclasses import dataclass, field
 from jaxnav.drive.chassis import Chassis, Motion, Part
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.limits import Command
-from jaxnav.drive.propulsion import Apart, Reach
 from jaxnav.drive.standstill import between
 from jaxnav.drive.ways import Fix
 
@@ -35,6 +29,56 @@ _LEAP_RAD = 0.1  # from frame to frame no vehicle turns farther beyond what is c
 # after which it must stand is for the naming.
 _GIVES_UP_M = 0.25
 _CLEARS = 0.5  # share of its margin below which a part is believed again
+
+_FACTOR = 2.0  # of speed and of time constant, see above
+_MARGIN_MPS = 0.05  # below it a motor may not turn at all, and `Odometer` allows as much
+DOUBT_M = 0.05  # beyond it nothing is decided any more: the error allowed in a fault-free drive
+_UNTRUE = 10  # excess of contradicting readings with markers in view: then the throttle is wrong
+
+
+@dataclass
+class Reach:
+    """The range in which a driven part is, as it follows its commands.
+
+    Attributes:
+        factor: of its gain; that of its time constant is two.
+    """
+
+    time_constant_s: float
+    factor: float = _FACTOR
+    least: float = 0.0
+    most: float = 0.0
+
+    def go(self, target: float, gap_s: float) -> None:
+        """Take what a command drives it towards, and for how long."""
+        slow = 1 - math.exp(-gap_s / (_FACTOR * self.time_constant_s))
+        least, most = sorted((target / self.factor, target * self.factor))
+        # Brakes and a better motor act at once.
+        self.least = min(least, self.least + slow * (least - self.least))
+        self.most = max(most, self.most + slow * (most - self.most))
+
+
+@dataclass
+class Apart:
+    """By how much two motions differ, m or rad, beyond what they may: summed, slowly forgotten."""
+
+    above: float = 0.0
+    below: float = 0.0
+
+    def add(self, least: float, most: float, allowed: float, kept: float) -> None:
+        """Take the bounds of a difference.
+
+        Args:
+            allowed: it may be off by this much.
+            kept: share of the sum that is not forgotten meanwhile.
+        """
+        self.above = max(0.0, kept * self.above + least - allowed)
+        self.below = max(0.0, kept * self.below - most - allowed)
+
+    @property
+    def most(self) -> float:
+        """Either way."""
+        return max(self.above, self.below)
 
 
 @dataclass
@@ -174,3 +218,58 @@ class Actuation:
             follows.begin()
             way_m = follows.contradicted_m
             self.gives_up = self.gives_up or (way_m is not None and way_m > _GIVES_UP_M)
+
+
+@dataclass
+class Propulsion:
+    """The odometer's speed of a driven part against its command: its only check without a marker.
+
+    With nominal parameters, a low battery or a slope, the throttle tells the speed within a factor
+    of two, and the time constant within another. Without a marker, a reading outside of that is as
+    likely wrong as right: the car may be blocked, or its encoder dead.
+
+    Attributes:
+        off_m: difference of the ways by odometer and by throttle since the last `confirm`, summed
+            while they contradict each other.
+    """
+
+    time_constant_s: float
+    off_m: float = 0.0
+    _nominal_mps: float = 0.0
+    _untrue: int = 0
+
+    def __post_init__(self) -> None:
+        self._reach_mps = Reach(self.time_constant_s)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the throttle contradicts the odometer, and nothing has confirmed it since."""
+        return self.off_m > DOUBT_M
+
+    def add_reading(
+        self, speed_mps: float, wanted_mps: float, gap_s: float, seeing: bool, disputed: bool
+    ) -> None:
+        """Take a reading that was believed.
+
+        Args:
+            wanted_mps: towards which the command since the reading before drives.
+            gap_s: time since then.
+            seeing: corners tell the way too.
+            disputed: the corners' way differs from the odometer's. Where the two agree, the
+                throttle is wrong: the car is carried, towed, replayed, or not as in its file.
+        """
+        self._reach_mps.go(wanted_mps, gap_s)
+        lagged = 1 - math.exp(-gap_s / self.time_constant_s)
+        self._nominal_mps += lagged * (wanted_mps - self._nominal_mps)
+        least_mps, most_mps = self._reach_mps.least, self._reach_mps.most
+        contradicts = not least_mps - _MARGIN_MPS <= speed_mps <= most_mps + _MARGIN_MPS
+        if disputed:
+            self._untrue = 0
+        elif seeing:
+            self._untrue = max(min(self._untrue + (1 if contradicts else -1), 2 * _UNTRUE), 0)
+        if contradicts and self._untrue < _UNTRUE:
+            self.off_m += abs(speed_mps - self._nominal_mps) * gap_s
+
+    def confirm(self) -> None:
+        """Forget the deviation, since corners tell where the car is."""
+        self.off_m = 0.0

@@ -24,14 +24,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import Vehicle, advance_bicycle
 from jaxnav.core.pose.observation import MODEL_SIGMA_PX
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.pilot import Outcome
 from jaxnav.files.executables import kept
 
@@ -73,12 +73,10 @@ class Delay(NamedTuple):
     Attributes:
         delay_s: NaN where nothing is known.
         sigma_s: inf where nothing is known.
-        stretches: how many were used.
     """
 
     delay_s: float
     sigma_s: float
-    stretches: int
 
     @property
     def known(self) -> bool:
@@ -91,29 +89,28 @@ class Delay(NamedTuple):
         return self.known and abs(self.delay_s) - SURE_SIGMAS * self.sigma_s > HARMLESS_S
 
 
-class Stretch(NamedTuple):
+class _Stretch(NamedTuple):
     """One camera's views and the odometry of a stretch; times in s since its beginning."""
 
-    camera: int
-    start_pose: Float[np.ndarray, " 3"]
-    edges_s: Float[np.ndarray, " K"]  # time from which each reading holds
-    speed_mps: Float[np.ndarray, " K"]
-    steering_rad: Float[np.ndarray, " K"]
-    times_s: Float[np.ndarray, " V"]
-    marker: Int[np.ndarray, " V"]
-    corners_px: Float[np.ndarray, "V 4 2"]
-    sigma_px: Float[np.ndarray, "V 4"]
-    used: Bool[np.ndarray, " V"]
+    camera: Any  # int32
+    edges_s: Any  # (K,), time from which each reading holds
+    speed_mps: Any  # (K,)
+    steering_rad: Any  # (K,)
+    times_s: Any  # (V,)
+    marker: Any  # (V,)
+    corners_px: Any  # (V, 4, 2)
+    sigma_px: Any  # (V, 4)
+    used: Any  # (V,)
 
 
 class _View(NamedTuple):
-    """The markers seen at one instant, one row each."""
+    """One marker in one camera's frame."""
 
     stamp_ns: int
-    camera: Int[np.ndarray, " N"]
-    marker: Int[np.ndarray, " N"]
-    corners_px: Float[np.ndarray, "N 4 2"]
-    sigma_px: Float[np.ndarray, "N 4"]
+    camera: int
+    marker: int
+    corners_px: Float[np.ndarray, "4 2"]
+    sigma_px: Float[np.ndarray, " 4"]
 
 
 class CameraDelays:
@@ -123,9 +120,9 @@ class CameraDelays:
         """Take the drive's rig, map and vehicle. Delays come beside the vehicle's corrections."""
         self._world = rig, markers.without_names(), vehicle.wheelbase_m
         self._dtype = np.asarray(vehicle.wheelbase_m).dtype
-        # Bounded memory: half a minute at 30 Hz, and a third of a minute at 50 Hz.
+        # Bounded memory: 20 s of readings at 50 Hz, 270 s of one marker at 30 Hz.
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=1024)
-        self._views: deque[_View] = deque(maxlen=1024)
+        self._views: deque[_View] = deque(maxlen=8192)
         self._open: deque[tuple[int, np.ndarray]] = deque(maxlen=_WAITING)  # begin, pose there
         self._next_ns = 0
         # For every camera: sums of information, information * delay, information * delay^2.
@@ -137,7 +134,7 @@ class CameraDelays:
         data = outcome.data
         if data is not None and data.odometry is not None:
             self.add_reading(outcome.stamp_ns, *data.odometry)
-        if data is not None and data.corners_px is not None:
+        if isinstance(data, Sighting):
             self.add_corners(outcome.stamp_ns, data)
         output = outcome.output
         if outcome.now_ns >= self._next_ns and bool(output.decided):
@@ -148,14 +145,12 @@ class CameraDelays:
         if not self._readings or stamp_ns > self._readings[-1][0]:
             self._readings.append((stamp_ns, speed_mps, steering_rad))
 
-    def add_corners(self, stamp_ns: int, data: EventData) -> None:
+    def add_corners(self, stamp_ns: int, data: Sighting) -> None:
         """Keep corners and their corrected stamp."""
-        assert data.corners_px is not None
-        assert data.visible is not None
-        assert data.sigma_px is not None
-        camera, marker = np.nonzero(data.visible)
-        corners_px, sigma_px = data.corners_px[camera, marker], data.sigma_px[camera, marker]
-        self._views.append(_View(stamp_ns, camera, marker, corners_px, sigma_px))
+        corners_px, sigma_px = data.corners_px[data.visible], data.sigma_px[data.visible]
+        lanes = np.argwhere(data.visible).tolist()
+        for (camera, marker), *seen in zip(lanes, corners_px, sigma_px, strict=True):
+            self._views.append(_View(stamp_ns, camera, marker, *seen))
 
     def add_pose(self, now_ns: int, pose: Float[np.ndarray, " 3"]) -> None:
         """Begin a stretch at the car's approximate pose, if it is time for one."""
@@ -173,9 +168,9 @@ class CameraDelays:
 
     def warm_up(self) -> None:
         """Compile the program, or load it."""
-        one = _View(10**9, np.zeros(1, int), np.zeros(1, int), np.zeros((1, 4, 2)), np.ones((1, 4)))
+        one = _View(10**9, 0, 0, np.zeros((4, 2)), np.ones(4))
         readings = [(k * 10**8, 0.1, 0.0) for k in range(30)]
-        self._equations(_stretch(0, 0, np.zeros(3), readings, [one], self._dtype), 0 * _PRIOR)
+        self._equations(_stretch(0, 0, readings, [one], self._dtype), 0 * _PRIOR)
 
     def solve(self) -> None:
         """Solve the oldest finished stretch, camera by camera."""
@@ -189,15 +184,11 @@ class CameraDelays:
         if not moved or len(readings) < 3:
             return
         for camera in range(len(self._counts)):
-            among = [
-                _View(view.stamp_ns, *(column[which] for column in view[1:]))
-                for view in views
-                if (which := view.camera == camera).any()
-            ]
-            if len(among) < _LEAST_VIEWS:
+            among = [view for view in views if view.camera == camera]
+            if len({view.stamp_ns for view in among}) < _LEAST_VIEWS:
                 continue
-            stretch = _stretch(camera, begin_ns, pose, readings, among, self._dtype)
-            delay_s, information = self._solved(stretch)
+            stretch = _stretch(camera, begin_ns, readings, among, self._dtype)
+            delay_s, information = self._solved(stretch, pose)
             if information > 0:
                 self._sums[camera] += information * np.array([1.0, delay_s, delay_s**2])
                 self._counts[camera] += 1
@@ -217,11 +208,9 @@ class CameraDelays:
         """Whether a camera, or all together, are surely later or earlier than is harmless."""
         return self.common_delay.late or any(one.late for one in self.delays)
 
-    def _solved(self, stretch: Stretch) -> tuple[float, float]:
+    def _solved(self, stretch: _Stretch, pose: np.ndarray) -> tuple[float, float]:
         """The delay in s and its information in 1/s^2, 0 where it can't be determined."""
-        p = np.zeros(len(_PRIOR))
-        p[:3] = stretch.start_pose
-        start = p.copy()
+        p = start = np.append(pose, np.zeros(len(_PRIOR) - 3))
         for _ in range(_STEPS):
             A, b, chi2 = self._equations(stretch, p)
             A = A + np.diag(1 / _PRIOR**2)
@@ -245,9 +234,8 @@ class CameraDelays:
         delay_s = p[_DELAY] / (variance * information)
         return float(delay_s), information / (_INFLATION**2 * max(chi2 / max(numbers, 1), 1.0))
 
-    def _equations(self, stretch: Stretch, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        arguments = (np.int32(stretch.camera), *stretch[2:], p.astype(self._dtype))
-        A, b, chi2 = jax.device_get(_normal(*self._world, *arguments))
+    def _equations(self, stretch: _Stretch, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        A, b, chi2 = jax.device_get(_normal(*self._world, stretch, p.astype(self._dtype)))
         return A.astype(float), b.astype(float), float(chi2)
 
 
@@ -255,26 +243,23 @@ def _of_stretches(sums: np.ndarray, count: int) -> Delay:
     """The mean delay of several stretches; sigma grows where they contradict each other."""
     information, first, second = sums
     if not information > 0:
-        return Delay(math.nan, math.inf, 0)
+        return Delay(math.nan, math.inf)
     mean_s = first / information
     scatter = max(second - information * mean_s**2, 0.0) / max(count - 1, 1)
     sigma_s = math.sqrt(max(scatter, 1.0) / information)
-    return Delay(float(mean_s), max(sigma_s, _LEAST_SIGMA_S), int(count))
+    return Delay(float(mean_s), max(sigma_s, _LEAST_SIGMA_S))
 
 
 def _stretch(
     camera: int,
     begin_ns: int,
-    start_pose: np.ndarray,
     readings: Sequence[tuple[int, float, float]],
     views: Sequence[_View],
     dtype: np.dtype,
-) -> Stretch:
+) -> _Stretch:
     """A stretch in arrays of fixed size; a reading holds from midway after the one before."""
     readings = _thinned(readings, _READINGS)
-    # One row for each marker at each instant.
-    rows = [(view.stamp_ns, *row) for view in views for row in zip(*view[2:], strict=True)]
-    stamps_ns, marker, corners_px, sigmas_px = zip(*_thinned(rows, _VIEWS), strict=True)
+    stamps_ns, _, marker, corners_px, sigmas_px = zip(*_thinned(views, _VIEWS), strict=True)
     stamps_s = np.array([(stamp_ns - begin_ns) / 1e9 for stamp_ns, _, _ in readings])
     edges_s = np.concatenate([stamps_s[:1], (stamps_s[1:] + stamps_s[:-1]) / 2])
     rest, more = _READINGS - len(readings), _VIEWS - len(stamps_ns)
@@ -284,9 +269,8 @@ def _stretch(
         return np.concatenate([array, np.repeat(array[-1:], extra, axis=0)])
 
     sigma_px = np.hypot(sigmas_px, math.hypot(MODEL_SIGMA_PX, _SCATTER_PX))
-    return Stretch(
-        camera,
-        start_pose,
+    return _Stretch(
+        np.int32(camera),
         # Padding begins after every time that is used.
         np.concatenate([edges_s, np.full(rest, 1e3)]).astype(dtype),
         padded([speed_mps for _, speed_mps, _ in readings], rest),
@@ -307,21 +291,10 @@ def _thinned(rows: Sequence[Any], most: int) -> list[Any]:
 
 @kept
 def _normal(
-    rig: CameraRig,
-    markers: MarkerMap,
-    wheelbase_m: Array,
-    camera: Array,
-    edges_s: Array,
-    speed_mps: Array,
-    steering_rad: Array,
-    times_s: Array,
-    marker: Array,
-    corners_px: Array,
-    sigma_px: Array,
-    used: Array,
-    p: Array,
+    rig: CameraRig, markers: MarkerMap, wheelbase_m: Array, stretch: _Stretch, p: Array
 ) -> tuple[Array, Array, Array]:
     """Normal equations of the views' whitened residuals, and their chi-square, at `_PRIOR`'s p."""
+    camera, edges_s, speed_mps, steering_rad, times_s, marker, corners_px, sigma_px, used = stretch
 
     def residuals(p: Array) -> tuple[Array, Array]:
         speed, steering = (1 + p[6]) * speed_mps, (1 + p[7]) * steering_rad + p[8]
@@ -350,16 +323,16 @@ def _normal(
         x_m, y_m = c * moved_m[:, 0] - s * moved_m[:, 1], s * moved_m[:, 0] + c * moved_m[:, 1]
         poses = jnp.stack([p[0] + x_m, p[1] + y_m, times[:-1, 2] + turn], axis=1)
 
-        points_world = markers.corners_world_m[marker]
-        one = jax.tree.map(lambda leaf: leaf[camera], rig.cameras)
-        T_camera_vehicle = jax.tree.map(lambda leaf: leaf[camera], rig.Ts_camera_vehicle)
+        one, T_camera_vehicle = jax.tree.map(
+            lambda leaf: leaf[camera], (rig.cameras, rig.Ts_camera_vehicle)
+        )
 
         def seen(pose: Array, points: Array) -> Array:
             points = transform_points(T_world_vehicle_from_planar(pose).inverse(), points)
             points = transform_points(T_camera_vehicle, points)
             return one.project(points + jnp.cross(p[3:6][None], points))
 
-        px = jax.vmap(seen)(poses, points_world) - corners_px
+        px = jax.vmap(seen)(poses, markers.corners_world_m[marker]) - corners_px
         r = (px / sigma_px[..., None]).reshape(len(times_s), 8)
         return r, r
 

@@ -1,10 +1,5 @@
 """What a vehicle's commands and readings say of its motion: of a car, and of other bases.
 
-    chassis = chassis_of(vehicle)
-    chassis.motion(reading)         # in the vehicle's own axes
-    chassis.driven_mps(reading)     # the speed of each driven part
-    chassis.wanted_mps(command)     # the speed towards which each is driven
-
 The checks of the loop ask whether a reading can be, whether anything moves, and how far. So they
 look at driven parts, each of which follows its command with a lag of first order and has its speed
 in m/s. A car has one, its speed along its course. Another base has three: its speeds ahead and to
@@ -14,8 +9,8 @@ its left, and that of its rim, which its turn moves: a turn on the spot is a way
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -32,7 +27,7 @@ _WIDEST_M = 0.5
 _CAR_READS = "speed_mps", "steering_rad"
 _BASE_READS = "speed_mps", "speed_mps", "turn_radps"
 
-# How exactly a command is followed, see `Part`. The throttle as in `propulsion`; what is commanded
+# How exactly a command is followed, see `Part`. The throttle as in `Propulsion`; what is commanded
 # in m/s, rad/s or rad is regulated, or a servo's.
 _THROTTLE_FACTOR, _FACTOR = 2.0, 1.4
 _SERVO_S = 0.15  # a servo's lag, with that of a bus
@@ -74,69 +69,6 @@ class Part(NamedTuple):
     slack_per_m: float
 
 
-class Chassis(Protocol):
-    """What one kind of vehicle's commands and readings say of its motion.
-
-    Attributes:
-        limits: of its commands.
-        tops_mps: the largest speed of each driven part.
-        time_constant_s: of the lag from a command to the speed.
-        lever_m: way of the rim by a turn of 1 rad; 0 of a car, which does not turn on the spot.
-        slides_m: way on which the wheels may turn the vehicle by 1 rad where they slide.
-        parts: of a command.
-    """
-
-    @property
-    def limits(self) -> Limits | TwistLimits: ...
-    @property
-    def parts(self) -> tuple[Part, ...]: ...
-    @property
-    def tops_mps(self) -> tuple[float, ...]: ...
-    @property
-    def time_constant_s(self) -> float: ...
-    @property
-    def lever_m(self) -> float: ...
-    @property
-    def slides_m(self) -> float: ...
-
-    def reads(self, reading: Reading) -> bool:
-        """Whether a reading is of this kind of vehicle, and one that a vehicle can have."""
-        ...
-
-    def motion(self, reading: Reading) -> Motion:
-        """The motion that a reading tells."""
-        ...
-
-    def driven_mps(self, reading: Reading) -> tuple[float, ...]:
-        """The speed of each driven part that a reading tells."""
-        ...
-
-    def wanted_mps(self, command: Command) -> tuple[float, ...]:
-        """The speed towards which a command drives each driven part."""
-        ...
-
-    def targets(self, command: Command) -> tuple[float, ...]:
-        """The rate or curvature that a command makes due of each part."""
-        ...
-
-    def seen(self, moved: Motion) -> tuple[float, ...]:
-        """The part of a motion, m or rad, that each part has made."""
-        ...
-
-    def believed_mps(
-        self,
-        heading_rad: float,
-        velocity: Float[np.ndarray, " 3"],
-        covariance: Float[np.ndarray, "3 3"],
-    ) -> tuple[tuple[float, float], ...]:
-        """The speed of each driven part that an estimate tells, and its sigma.
-
-        Args:
-            velocity: derivative of (x_m, y_m, psi_rad) in the world, and its covariance.
-        """
-        ...
-
-
 def pace_mps(driven_mps: tuple[float, ...]) -> float:
     """How fast what moves fastest goes, by the speeds of the driven parts."""
     if len(driven_mps) == 1:
@@ -147,7 +79,13 @@ def pace_mps(driven_mps: tuple[float, ...]) -> float:
 
 @dataclass(frozen=True)
 class CarChassis:
-    """A car: its throttle drives its speed along its course. Implements `Chassis`."""
+    """A car: its throttle drives its speed along its course.
+
+    Attributes:
+        tops_mps: the largest speed of each driven part.
+        time_constant_s: of the lag from a command to the speed.
+        lever_m: way of the rim by a turn of 1 rad; 0 of a car, which does not turn on the spot.
+    """
 
     limits: Limits
     tops_mps: tuple[float, ...]
@@ -170,42 +108,42 @@ class CarChassis:
 
     @property
     def slides_m(self) -> float:
-        """See `Chassis`: about one axle it turns by way / wheelbase."""
+        """Way on which sliding wheels may turn it by 1 rad: about one axle, way / wheelbase."""
         return self.wheelbase_m
-
-    def reads(self, reading: Reading) -> bool:
-        """See `Chassis`."""
-        return isinstance(reading, Odometry) and _can_be(_CAR_READS, reading.values)
-
-    def motion(self, reading: Reading) -> Motion:
-        """See `Chassis`; Eqs. 4 to 7 of the paper, as `velocity_world`."""
-        speed_mps, steering_rad = reading.values
-        return car_motion(speed_mps, steering_rad, self.wheelbase_m)
-
-    def driven_mps(self, reading: Reading) -> tuple[float, ...]:
-        """See `Chassis`."""
-        return reading.values[:1]
-
-    def wanted_mps(self, command: Command) -> tuple[float, ...]:
-        """See `Chassis`."""
-        return (command[1] * self.speed_per_throttle_mps,)
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """See `Chassis`: throttle and steering."""
+        """The parts of a command: throttle and steering."""
         lag_s, factor = self.time_constant_s, _THROTTLE_FACTOR
         return (
             Part(Fault.DRIVE_CONTRADICTED, False, False, lag_s, factor, _MARGIN_M, _SLACK),
             Part(Fault.TURN_CONTRADICTED, True, True, _SERVO_S, _FACTOR, _MARGIN_RAD, _SLACK_RADPM),
         )
 
+    def reads(self, reading: Reading) -> bool:
+        """Whether a reading is of this kind of vehicle, and one that a vehicle can have."""
+        return isinstance(reading, Odometry) and _can_be(_CAR_READS, reading.values)
+
+    def motion(self, reading: Reading) -> Motion:
+        """The motion that a reading tells; Eqs. 4 to 7 of the paper, as `velocity_world`."""
+        speed_mps, steering_rad = reading.values
+        return car_motion(speed_mps, steering_rad, self.wheelbase_m)
+
+    def driven_mps(self, reading: Reading) -> tuple[float, ...]:
+        """The speed of each driven part that a reading tells."""
+        return reading.values[:1]
+
+    def wanted_mps(self, command: Command) -> tuple[float, ...]:
+        """The speed towards which a command drives each driven part."""
+        return (command[1] * self.speed_per_throttle_mps,)
+
     def targets(self, command: Command) -> tuple[float, ...]:
-        """See `Chassis`: speed and curvature."""
+        """The rate or curvature that a command makes due of each part: speed and curvature."""
         along = car_motion(1.0, command[0], self.wheelbase_m)
         return *self.wanted_mps(command), along.turn_radps
 
     def seen(self, moved: Motion) -> tuple[float, ...]:
-        """See `Chassis`: the way along its course, and the turn."""
+        """What each part has made of a motion: the way along the course, m, and the turn, rad."""
         way_m = math.copysign(math.hypot(moved[0], moved[1]), moved.forward_mps)
         return way_m, moved.turn_radps
 
@@ -215,7 +153,11 @@ class CarChassis:
         velocity: Float[np.ndarray, " 3"],
         covariance: Float[np.ndarray, "3 3"],
     ) -> tuple[tuple[float, float], ...]:
-        """See `Chassis`: the speed along the course."""
+        """The speed of each driven part that an estimate tells, and its sigma.
+
+        Args:
+            velocity: derivative of (x_m, y_m, psi_rad) in the world, and its covariance.
+        """
         x_mps, y_mps, _ = velocity.tolist()
         forward_mps = math.cos(heading_rad) * x_mps + math.sin(heading_rad) * y_mps
         speed_mps = math.copysign(math.hypot(x_mps, y_mps), forward_mps)
@@ -224,7 +166,7 @@ class CarChassis:
 
 @dataclass(frozen=True)
 class BaseChassis:
-    """A base that is driven by a twist. Implements `Chassis`."""
+    """A base that is driven by a twist; attributes and methods as of `CarChassis`."""
 
     limits: TwistLimits
     time_constant_s: float
@@ -243,53 +185,47 @@ class BaseChassis:
 
     @property
     def slides_m(self) -> float:
-        """See `Chassis`: about one wheel it turns by way / half its track."""
+        """About one wheel it turns by way / half its track."""
         return self.lever_m
 
     @property
     def tops_mps(self) -> tuple[float, ...]:
-        """See `Chassis`."""
-        limits = self.limits
-        return limits.forward_mps, limits.left_mps, limits.turn_radps * self.lever_m
-
-    def reads(self, reading: Reading) -> bool:
-        """See `Chassis`."""
-        return isinstance(reading, TwistOdometry) and _can_be(_BASE_READS, reading.values)
-
-    def motion(self, reading: Reading) -> Motion:
-        """See `Chassis`."""
-        return Motion(*reading.values)
-
-    def driven_mps(self, reading: Reading) -> tuple[float, ...]:
-        """See `Chassis`."""
-        return self.wanted_mps(reading.values)
-
-    def wanted_mps(self, command: Command) -> tuple[float, ...]:
-        """See `Chassis`."""
-        forward_mps, left_mps, turn_radps = command
-        return forward_mps, left_mps, turn_radps * self.lever_m
+        """Ahead, to the left, and of the rim."""
+        return self.wanted_mps(astuple(self.limits))
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """See `Chassis`: ahead, to the left and the turn."""
-        lag_s = self.time_constant_s
-        ahead, aside, turn = (
-            Fault.DRIVE_CONTRADICTED,
-            Fault.SIDEWAYS_CONTRADICTED,
-            Fault.TURN_CONTRADICTED,
-        )
+        """Ahead, to the left and the turn."""
+        rate = False, self.time_constant_s, _FACTOR
         return (
-            Part(ahead, False, False, lag_s, _FACTOR, _MARGIN_M, _SLACK),
-            Part(aside, False, False, lag_s, _FACTOR, _MARGIN_M, _SLACK),
-            Part(turn, True, False, lag_s, _FACTOR, _MARGIN_RAD, _SLACK_RADPM),
+            Part(Fault.DRIVE_CONTRADICTED, False, *rate, _MARGIN_M, _SLACK),
+            Part(Fault.SIDEWAYS_CONTRADICTED, False, *rate, _MARGIN_M, _SLACK),
+            Part(Fault.TURN_CONTRADICTED, True, *rate, _MARGIN_RAD, _SLACK_RADPM),
         )
 
+    def reads(self, reading: Reading) -> bool:
+        """See `CarChassis`."""
+        return isinstance(reading, TwistOdometry) and _can_be(_BASE_READS, reading.values)
+
+    def motion(self, reading: Reading) -> Motion:
+        """See `CarChassis`."""
+        return Motion(*reading.values)
+
+    def driven_mps(self, reading: Reading) -> tuple[float, ...]:
+        """See `CarChassis`."""
+        return self.wanted_mps(reading.values)
+
+    def wanted_mps(self, command: Command) -> tuple[float, ...]:
+        """See `CarChassis`."""
+        forward_mps, left_mps, turn_radps = command
+        return forward_mps, left_mps, turn_radps * self.lever_m
+
     def targets(self, command: Command) -> tuple[float, ...]:
-        """See `Chassis`."""
+        """See `CarChassis`."""
         return command
 
     def seen(self, moved: Motion) -> tuple[float, ...]:
-        """See `Chassis`."""
+        """See `CarChassis`."""
         return moved
 
     def believed_mps(
@@ -298,7 +234,7 @@ class BaseChassis:
         velocity: Float[np.ndarray, " 3"],
         covariance: Float[np.ndarray, "3 3"],
     ) -> tuple[tuple[float, float], ...]:
-        """See `Chassis`: ahead, to the left, and of the rim."""
+        """See `CarChassis`."""
         x_mps, y_mps, turn_radps = velocity.tolist()
         c, s = math.cos(heading_rad), math.sin(heading_rad)
         sigma_mps = root_of_sum(covariance)
@@ -310,7 +246,10 @@ class BaseChassis:
         )
 
 
-def chassis_of(vehicle: Vehicle | TwistBase) -> CarChassis | BaseChassis:
+Chassis = CarChassis | BaseChassis
+
+
+def chassis_of(vehicle: Vehicle | TwistBase) -> Chassis:
     """That of a vehicle's description."""
     return BaseChassis.of(vehicle) if turns_by_twist(vehicle) else CarChassis.of(vehicle)
 

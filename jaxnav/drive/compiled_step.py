@@ -60,13 +60,6 @@ def compile_or_load(
     return call
 
 
-def is_compiled(
-    function: Callable[..., PyTree], navigator: Navigator, folder: Path, *arguments: PyTree
-) -> bool:
-    """Whether `compile_or_load(function, navigator, folder)(*told)` finds its executable."""
-    return executables.is_kept(function, (strip_static(navigator), *arguments), folder)
-
-
 def strip_static(navigator: Navigator) -> Navigator:
     """The navigator without its vehicle's sensor corrections, its map's origin and its markers'
     names: these are static fields, not leaves, and nothing is computed with them."""
@@ -77,11 +70,7 @@ def strip_static(navigator: Navigator) -> Navigator:
         if not isinstance(part, Vehicle):
             return part
         return replace(
-            part,
-            speed_scale=1.0,
-            steering_gain=1.0,
-            steering_offset_rad=0.0,
-            camera_delay_s=0.0,
+            part, speed_scale=1.0, steering_gain=1.0, steering_offset_rad=0.0, camera_delay_s=0.0
         )
 
     return jax.tree.map(

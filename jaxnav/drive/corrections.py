@@ -8,7 +8,7 @@ every value stays the same, bit for bit.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # the guard's process corrects without JAX and OpenCV
 
 @dataclass(frozen=True)
 class Corrections:
-    """The corrections of one vehicle; see `Vehicle` in `models.bicycle`. Other bases have none."""
+    """The corrections of one vehicle, named as in `Vehicle`. Other bases have none."""
 
     speed_scale: float = 1.0
     steering_gain: float = 1.0
@@ -37,13 +37,8 @@ class Corrections:
         """The corrections in a vehicle's description."""
         if turns_by_twist(vehicle):
             return Corrections()
-        return Corrections(
-            vehicle.speed_scale,
-            vehicle.steering_gain,
-            vehicle.steering_offset_rad,
-            vehicle.camera_delay_s,
-            float(vehicle.steering_limit_rad),
-        )
+        names = (field.name for field in fields(Corrections))
+        return Corrections(*(float(getattr(vehicle, name)) for name in names))
 
     # The late sensor is moved back, never the other one ahead: no stamp lies in the future.
     @cached_property

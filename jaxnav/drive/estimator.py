@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,11 +29,7 @@ MeanRate = Callable[[int, int], float]  # of the interval between two times, ns
 
 
 def advance_packed(
-    navigator: Navigator,
-    belief: Packed,
-    control: Packed,
-    events: Packed,
-    numbers: Int[Array, "4"],
+    navigator: Navigator, belief: Packed, control: Packed, events: Packed, numbers: Int[Array, "4"]
 ) -> tuple[Packed, Packed, Packed, Packed]:
     """`advance` with its arguments and results packed into a few vectors.
 
@@ -50,9 +45,8 @@ def advance_packed(
 def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
     """The belief and control state at the start of a drive."""
     state = navigator.init()
-    return PackedLayout.of(state.belief).pack(state.belief), PackedLayout.of(state.control).pack(
-        state.control
-    )
+    belief, control = (PackedLayout.of(it).pack(it) for it in (state.belief, state.control))
+    return belief, control
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,6 @@ class FusionResult:
     output: Output
     belief: Belief
     refused: bool  # the event is older than all that is kept
-    events: int  # number of events fused: this one and those after it
 
 
 class Estimator:
@@ -127,14 +120,14 @@ class Estimator:
             base_ns = self._belief_ns if self._history is not None else now_ns
             belief, _, output = self._call(self._belief, [], base_ns, 0, now_ns, elapsed_ns)
             believed = belief.fetch().unpack()
-            return FusionResult(output.fetch().unpack(), believed, data is not None, 0)
+            return FusionResult(output.fetch().unpack(), believed, data is not None)
         base, entries = placed
         assert self._history is not None
         new = next(index for index, entry in enumerate(entries) if entry.data is data)
         belief, then, known = self._fused(base, entries, new, now_ns, elapsed_ns)
         self._belief, self._belief_ns = belief, entries[-1].stamp_ns
         self._history.store(belief, entries[new], then)
-        return FusionResult(known, belief.fetch().unpack(), False, len(entries))
+        return FusionResult(known, belief.fetch().unpack(), False)
 
     def _fused(
         self,
@@ -162,11 +155,13 @@ class Estimator:
             base_ns = part[-1][0]
             if holds:
                 then, of_new = after, output
-        return (
-            belief,
-            then,
-            _with_evidence(output.fetch().unpack(), of_new.fetch().unpack()),
+        # What the new event said stands in the output of its own part.
+        completed: Output = eqx.tree_at(
+            lambda output: [getattr(output, field.name) for field in fields(Evidence)],
+            output.fetch().unpack(),
+            [getattr(of_new.fetch().unpack(), field.name) for field in fields(Evidence)],
         )
+        return belief, then, completed
 
     def _call(
         self,
@@ -216,16 +211,6 @@ class Estimator:
                 corners["corners_px"][index] = data.corners_px
                 corners["visible"][index] = data.visible
                 corners["corner_sigma_px"][index] = data.sigma_px
-
-
-def _with_evidence(output: Output, of_new: Output) -> Output:
-    """An output with the evidence fields of another one."""
-
-    def evidence(output: Output) -> list[Any]:
-        return [getattr(output, field.name) for field in fields(Evidence)]
-
-    completed: Output = eqx.tree_at(evidence, output, evidence(of_new))
-    return completed
 
 
 def gyro_of(navigator: Navigator) -> Gyro | None:

@@ -10,7 +10,7 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.detection.observe import CornerLanes, observe
 from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.stamps import Stamps
 from jaxnav.files.ranges import is_within
 
@@ -63,7 +63,7 @@ class FrameIntake:
 
     def check(
         self, frames: Sequence[FrameDetections], now_ns: int, frozen: Frozen | None = None
-    ) -> tuple[EventData | None, int, Fault]:
+    ) -> tuple[Sighting | None, int, Fault]:
         """The data of frames, their stamp, and the faults found in them.
 
         Args:
@@ -76,8 +76,7 @@ class FrameIntake:
         detections = [_NONE] * len(self.newest_ns)
         stamps_ns: dict[int, int] = {}
         for frame in frames:
-            if frame.faults:
-                faults |= frame.faults
+            faults |= frame.faults
             stamps = self._stamps[frame.camera]
             jumps = stamps.jumps
             stamp_ns = stamps.take(frame.stamp_ns, now_ns)
@@ -95,14 +94,14 @@ class FrameIntake:
             if len(frame.detections):
                 detections[frame.camera], stamps_ns[frame.camera] = frame.detections, stamp_ns
         seen = observe(detections, self._markers)
-        if seen.unknown:
-            faults |= Fault.UNKNOWN_MARKER
-        if seen.duplicates:
-            faults |= Fault.DUPLICATE_MARKER
-        if seen.mirrored:
-            faults |= Fault.CORNERS_MIRRORED
-        if hide_nowhere(seen):
-            faults |= Fault.CORNERS_NOT_FINITE
+        for is_there, fault in (
+            (seen.unknown, Fault.UNKNOWN_MARKER),
+            (seen.duplicates, Fault.DUPLICATE_MARKER),
+            (seen.mirrored, Fault.CORNERS_MIRRORED),
+            (hide_nowhere(seen), Fault.CORNERS_NOT_FINITE),
+        ):
+            if is_there:
+                faults |= fault
         taken_ns, frozen_seen = self._leave_out_frozen(seen, stamps_ns, now_ns, frozen)
         if frozen_seen:
             faults |= Fault.FRAME_FROZEN
@@ -110,7 +109,10 @@ class FrameIntake:
             return None, now_ns, faults
         if self._corner_sigma_px is not None:
             seen.sigma_px[seen.visible] = self._corner_sigma_px
-        return EventData(None, seen.corners_px, seen.visible, seen.sigma_px), taken_ns, faults
+        sighting = Sighting(
+            corners_px=seen.corners_px, visible=seen.visible, sigma_px=seen.sigma_px
+        )
+        return sighting, taken_ns, faults
 
     def _leave_out_frozen(
         self, seen: CornerLanes, stamps_ns: dict[int, int], now_ns: int, frozen: Frozen | None

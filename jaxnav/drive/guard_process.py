@@ -8,10 +8,10 @@ the deadline of the next one, on the clock that all processes of a machine share
 comes too late is not obeyed, and when none comes in time the vehicle is stopped. It is stopped at
 once when the computing process ends, however it ends, since that closes the sockets.
 
-On the first socket JSON and commands come in and events go out; on the second a byte requests a
-reading. All of these are framed, see `Link`. Once it has tripped, it says ten times a second
-whether the vehicle has heard the stop. A driver that holds the interpreter silences it, and so does
-one that does not come back from `stop`.
+On the first connection orders and commands come in and events go out; on the second readings are
+requested and sent. No objects of a plug-in are among them. Once it has tripped, it says ten times a
+second whether the vehicle has heard the stop. A driver that holds the interpreter silences it, and
+so does one that does not come back from `stop`.
 
 At once it forks another process, the spare, which waits on the third socket. Where this one hangs
 or dies the spare opens the vehicle and stops it: then nothing that may have run out is needed.
@@ -20,23 +20,20 @@ or dies the spare opens the vehicle and stops it: then nothing that may have run
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import select
 import signal
-import socket
-import struct
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from jaxnav.drive import plugins
-from jaxnav.drive.corrections import Corrections
 from jaxnav.drive.guard import Guard
 from jaxnav.drive.interfaces import (
     MOST_TURNS,
@@ -44,116 +41,21 @@ from jaxnav.drive.interfaces import (
     Ending,
     GyroReading,
     HasGyro,
-    Reading,
     Setup,
     SharesProcess,
-    reading_of,
 )
-from jaxnav.drive.limits import Command, limits_from
+from jaxnav.drive.limits import Command
 from jaxnav.drive.output import FreeOutput
 from jaxnav.drive.priority import NICE, lower_nice
 from jaxnav.errors import BadInput
 
-_COMMAND = struct.Struct("<cQq")  # kind, sequence, deadline_ns; then the numbers of the command
-# Kind, stamp_ns, valid, how many numbers follow, how many gyro readings; then these, then a text.
-_READING = struct.Struct("<cq?BB")
-_GYRO = struct.Struct("<qd")  # stamp_ns, turn_radps
-KIND_COMMAND, KIND_TEXT, KIND_READING, KIND_FAILED = b"c", b"t", b"r", b"f"
 HEARD_WITHIN_S = 600.0  # an orphan repeats the stop for this long to a vehicle that does not hear
 _HEAVY = ("jax", "cv2")  # modules that the guard's process must not import
 _PRIORITY = 20  # in the real-time class: above the computing process, below the kernel's threads
-_LARGEST = 2**24
 _SAYS_S = 0.1  # period at which it says whether a stop was heard; `moved_vehicle` waits for five
 # A `stop` that lasts longer counts as no answer. With the longest wait for a command (0.2 s by
 # default) and for an answer (0.5 s) it leaves 0.8 of 2 s for another one to open the vehicle.
 _TRIES_S = 0.5
-
-
-def command_frame(sequence: int, deadline_ns: int, command: Command) -> bytes:
-    """The frame of a command."""
-    numbers = struct.pack(f"<{len(command)}d", *command)
-    return _COMMAND.pack(KIND_COMMAND, sequence, deadline_ns) + numbers
-
-
-def command_of(frame: bytes) -> tuple[int, int, Command]:
-    """The sequence, deadline_ns and command of a frame."""
-    _, sequence, deadline_ns = _COMMAND.unpack_from(frame)
-    count = (len(frame) - _COMMAND.size) // 8
-    return sequence, deadline_ns, struct.unpack_from(f"<{count}d", frame, _COMMAND.size)
-
-
-def reading_frame(read: Reading, gyro: Sequence[GyroReading], over: str) -> bytes:
-    """The frame of a reading, the newest gyro readings, and why the drive is over or nothing."""
-    gyro = gyro[-MOST_TURNS:]
-    head = _READING.pack(KIND_READING, read.stamp_ns, read.valid, len(read.values), len(gyro))
-    numbers = struct.pack(f"<{len(read.values)}d", *read.values)
-    turns = b"".join(_GYRO.pack(one.stamp_ns, one.turn_radps) for one in gyro)
-    return head + numbers + turns + over.encode()
-
-
-def reading_from(frame: bytes) -> tuple[Reading, tuple[GyroReading, ...], str]:
-    """The parts of a `reading_frame`."""
-    _, stamp_ns, valid, count, turns = _READING.unpack_from(frame)
-    values = struct.unpack_from(f"<{count}d", frame, _READING.size)
-    begin = _READING.size + 8 * count
-    end = begin + _GYRO.size * turns
-    gyro = tuple(GyroReading(*row) for row in _GYRO.iter_unpack(frame[begin:end]))
-    return reading_of(stamp_ns, values, valid), gyro, frame[end:].decode()
-
-
-class Link:
-    """Messages over a stream socket, each a frame: four bytes of length, then the content."""
-
-    def __init__(self, end: socket.socket):
-        self.socket = end
-        self._begun = b""
-        self._frames: list[bytes] = []
-
-    def send(self, content: bytes) -> None:
-        """Send one frame completely, or raise OSError."""
-        self.socket.sendall(struct.pack("<I", len(content)) + content)
-
-    def tell(self, **said: Any) -> None:
-        """Send a mapping as JSON."""
-        self.send(KIND_TEXT + json.dumps(said).encode())
-
-    def ready(self, timeout_s: float) -> bool:
-        """Wait until `receive` would not; return whether that is so before the time is over."""
-        look = select.poll()  # not `select`, which can't look at descriptors above 1023
-        look.register(self.socket, select.POLLIN)
-        return bool(self._frames or look.poll(timeout_s * 1e3))
-
-    def receive(self) -> list[bytes]:
-        """The complete frames received, possibly none; waits for bytes if no frame is ready.
-
-        Raises:
-            EOFError: the other end is closed.
-            OSError: the socket timed out or broke.
-        """
-        frames, self._frames = self._frames, []
-        if frames:
-            return frames
-        more = self.socket.recv(65536)
-        if not more:
-            raise EOFError
-        self._begun += more
-        while len(self._begun) >= 4:
-            (size,) = struct.unpack_from("<I", self._begun)
-            if size > _LARGEST:
-                raise OSError(f"a frame of {size} bytes")
-            if len(self._begun) < 4 + size:
-                break
-            frames.append(self._begun[4 : 4 + size])
-            self._begun = self._begun[4 + size :]
-        return frames
-
-    def mapping(self) -> dict[str, Any]:
-        """Wait for the next mapping and return it."""
-        while not (frames := self.receive()):
-            pass
-        self._frames = frames[1:]
-        said: dict[str, Any] = json.loads(frames[0][1:])
-        return said
 
 
 class CanNotMoveError(BaseException):
@@ -184,57 +86,59 @@ def main(commands: int, readings: int | None, spare: int | None = None) -> None:
     os.set_blocking(wakeup[1], False)
     signal.set_wakeup_fd(wakeup[1], warn_on_full_buffer=False)
     signal.signal(signal.SIGTERM, lambda number, frame: None)  # sent when the machine shuts down
-    link = Link(socket.socket(fileno=commands))
+    link = Connection(commands)
     with suppress(EOFError, OSError):
-        order = link.mapping()
+        order = link.recv()
         only_stops = order.get("only_stops", False)  # in the place of one that hung or died
         if only_stops:
-            link.tell(received=True)
+            link.send({"received": True})
             _preferred()  # before the plug-in is imported, as the vehicle may be driving
         try:
             factory = _factory(order["vehicle"], order["path"])
             if not only_stops:
-                link.tell(ready=True, spare=spare)
-                order |= link.mapping()
+                link.send({"ready": True, "spare": spare})
+                order |= link.recv()
             vehicle = opened(factory, order)
         except CanNotMoveError as problem:
-            link.tell(stays=str(problem))
+            link.send({"stays": str(problem)})
             return
         except BadInput as bad:
-            link.tell(bad=str(bad))
+            link.send({"bad": str(bad)})
             return
         priority = _preferred()  # of this thread, and of the guard's thread, which it starts
         guard = Guard(
             vehicle,
-            limits_from(order["limits"]),
+            order["limits"],
             order["timeout_s"],
-            corrections=Corrections(**order["corrections"]),
+            corrections=order["corrections"],
             resumes=order["resumes"],
         )
         threading.Thread(target=_report, args=(guard, link), daemon=True).start()
         try:
-            link.tell(opened=float(vehicle.timeout_s), priority=priority)
+            link.send({"opened": float(vehicle.timeout_s), "priority": priority})
             if readings is not None and not only_stops:
-                asked = Link(socket.socket(fileno=readings))
+                asked = Connection(readings)  # which stays open until the vehicle is released
                 _Server(vehicle, guard, link, asked, wakeup[0]).serve()
         finally:
             guard.close(HEARD_WITHIN_S)
             with suppress(OSError):
-                link.tell(closed=True, unheard=guard.unheard)
+                link.send({"closed": True, "unheard": guard.unheard})
 
 
 class _Server:
     """The server of both sockets, until it is told to close."""
 
-    def __init__(self, vehicle: AnyVehicle, guard: Guard, link: Link, asked: Link, signals: int):
+    def __init__(
+        self, vehicle: AnyVehicle, guard: Guard, link: Connection, asked: Connection, signals: int
+    ):
         self._vehicle, self._guard = vehicle, guard
         self._link, self._asked, self._signals = link, asked, signals
-        self._sequence = 0
+        self._commanded = False
 
     def serve(self) -> None:
         """Serve commands before readings, since a reading may take as long as the driver does."""
         look = select.poll()
-        for descriptor in (self._link.socket, self._asked.socket, self._signals):
+        for descriptor in (self._link, self._asked, self._signals):
             look.register(descriptor, select.POLLIN)
         try:
             while True:
@@ -242,43 +146,45 @@ class _Server:
                 if self._signals in ready:
                     self._guard.trip("the guard's process was told to end (SIGTERM)")
                     os.read(self._signals, 64)
-                if self._link.socket.fileno() in ready:
-                    for frame in self._link.receive():
-                        if not self._obey(frame):
-                            return
-                elif self._asked.socket.fileno() in ready:
-                    for _ in self._asked.receive():
-                        self._asked.send(self._reading())
+                if self._link.fileno() in ready:
+                    if not self._obey(self._link.recv()):
+                        return
+                elif self._asked.fileno() in ready:
+                    self._asked.recv()
+                    self._asked.send(self._reading())
         except (EOFError, OSError):
             self._guard.trip("the process that computes is gone")
 
-    def _obey(self, frame: bytes) -> bool:
-        """Execute a frame; return False if it says to close."""
-        if frame[:1] != KIND_COMMAND:
-            said = json.loads(frame[1:])
+    def _obey(self, said: dict[str, Any] | tuple[int, Command]) -> bool:
+        """Execute an order, or a command with its deadline_ns; return False if it says to close."""
+        if isinstance(said, dict):
             if "stop" in said:
                 self._guard.trip(said["stop"], said["late"])
             if "resume" in said and not self._guard.resume():
-                self._link.tell(tripped=self._guard.reason or "it does not resume", late=False)
+                why = self._guard.reason or "it does not resume"
+                self._link.send({"tripped": why, "late": False})
             return "close" not in said
-        sequence, deadline_ns, command = command_of(frame)
-        if sequence > self._sequence:
-            if not self._sequence:
-                self._guard.arm()  # the first command: from now on commands must come in time
-            self._sequence = sequence
-            self._guard.write(*command, deadline_ns=deadline_ns)
+        deadline_ns, command = said
+        if not self._commanded:
+            self._guard.arm()  # the first command: from now on commands must come in time
+            self._commanded = True
+        self._guard.write(*command, deadline_ns=deadline_ns)
         return True
 
-    def _reading(self) -> bytes:
+    def _reading(self) -> tuple[Any, ...] | str:
+        """The arguments of `reading_of`, those of the newest `GyroReading`s, and why the drive is
+        over or nothing; or why there is none."""
         over = self._vehicle.over if isinstance(self._vehicle, Ending) else None
         try:
             read = self._vehicle.read()
-            return reading_frame(read, self._turns(), over or "")
+            values = tuple(map(float, read.values))
+            turns = [(int(t.stamp_ns), float(t.turn_radps)) for t in self._turns()[-MOST_TURNS:]]
+            return (int(read.stamp_ns), values, bool(read.valid)), turns, str(over or "")
         except OSError as error:
-            return KIND_FAILED + str(error).encode()[:1000]
+            return str(error)[:1000]
         except Exception as error:  # its meaning is unknown: the vehicle stops
             self._guard.trip(f"the vehicle: {type(error).__name__}: {error}")
-            return KIND_FAILED + f"{type(error).__name__}: {error}".encode()[:1000]
+            return f"{type(error).__name__}: {error}"[:1000]
 
     def _turns(self) -> Sequence[GyroReading]:
         """The gyro's readings, of which none is no reason to go without the odometer."""
@@ -287,7 +193,7 @@ class _Server:
         return ()
 
 
-def _report(guard: Guard, link: Link) -> None:
+def _report(guard: Guard, link: Connection) -> None:
     """Report each trip at once, and then, until it resumes, again and again whether the vehicle has
     heard the stop: in a thread, since the main one may hang in the driver."""
     with suppress(OSError):
@@ -295,10 +201,10 @@ def _report(guard: Guard, link: Link) -> None:
             guard.wait()
             since_s = time.monotonic()
             reason = guard.reason
-            link.tell(tripped=reason, late=guard.late)
+            link.send({"tripped": reason, "late": guard.late})
             while guard.tripped and guard.reason == reason:
                 if guard.heard or time.monotonic() - max(since_s, guard.tried_s) < _TRIES_S:
-                    link.tell(heard=guard.heard, unheard=guard.unheard)
+                    link.send({"heard": guard.heard, "unheard": guard.unheard})
                 time.sleep(_SAYS_S)
 
 
@@ -330,7 +236,7 @@ def opened(factory: Any, order: dict[str, Any]) -> AnyVehicle:
     setup = Setup(
         missing("rig"), missing("markers"), numbers, start, received["seed"], received["options"]
     )
-    return plugins.opened_vehicle(order["vehicle"], factory, setup)
+    return plugins.open_vehicle(order["vehicle"], setup, factory)
 
 
 def _preferred() -> str:
@@ -345,16 +251,11 @@ def _preferred() -> str:
     return "raised priority" if lower_nice(NICE) else "no priority: it may not be raised here"
 
 
-def _forked() -> int | None:
-    """Fork the spare, before there is a thread; return its id, 0 in itself, None without room."""
-    with suppress(OSError):
-        return os.fork()
-    return None
-
-
 if __name__ == "__main__":
     ends = [int(number) for number in sys.argv[1:]]
-    child = _forked()
+    child = None
+    with suppress(OSError):  # without room there is no spare
+        child = os.fork()  # before there is a thread
     for end in ends[:2] if child == 0 else ends[2:]:
         os.close(end)  # whoever is at the other end must notice this one's death
     with FreeOutput():  # a driver that prints errors must not wait for a reader

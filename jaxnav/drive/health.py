@@ -107,24 +107,21 @@ class Monitor:
         self._doubts = max(self._doubts - 1, 0) if believed else min(self._doubts + 1, 2 * _OFTEN)
 
     def _missing(self, senses: Senses) -> Fault:
-        limits = self.timeouts
+        limits, located = self.timeouts, senses.located
         stale = [age_s > limits.camera_stale_s for age_s in senses.cameras_age_s]
+        unsure = senses.decided and not senses.position_sigma_m <= limits.position_sigma_m
         faults = _NO_FAULT
-        if any(stale):
-            faults |= Fault.CAMERA_STALE
-        if stale and all(stale):
-            faults |= Fault.CAMERAS_STALE
-        if senses.odometry_age_s > limits.odometry_stale_s:
-            faults |= Fault.ODOMETRY_STALE
-        if senses.restarts > MOST_RESTARTS:
-            faults |= Fault.RESTARTED_OFTEN
-        if senses.located:
-            if senses.fix_age_s > limits.flag_s:
-                faults |= Fault.NO_MARKER
-            if not senses.position_sigma_m <= limits.position_sigma_m and senses.decided:
-                faults |= Fault.UNSURE
-            if senses.distance_m > limits.distance_m:
-                faults |= Fault.FAR_FROM_FIX
+        for is_so, fault in (
+            (any(stale), Fault.CAMERA_STALE),
+            (stale and all(stale), Fault.CAMERAS_STALE),
+            (senses.odometry_age_s > limits.odometry_stale_s, Fault.ODOMETRY_STALE),
+            (senses.restarts > MOST_RESTARTS, Fault.RESTARTED_OFTEN),
+            (located and senses.fix_age_s > limits.flag_s, Fault.NO_MARKER),
+            (located and unsure, Fault.UNSURE),
+            (located and senses.distance_m > limits.distance_m, Fault.FAR_FROM_FIX),
+        ):
+            if is_so:
+                faults |= fault
         return faults
 
     def _wanted(self, senses: Senses, faults: Fault) -> Health:

@@ -30,9 +30,19 @@ class EventData:
     visible: Bool[np.ndarray, "C M"] | None = None
     sigma_px: Float[np.ndarray, "C M 4"] | None = None  # positive
 
-    def hiding(self, hidden: Bool[np.ndarray, "C M"]) -> "EventData | None":
-        """The data without these views of markers; None where that leaves no marker."""
-        assert self.visible is not None
+
+@dataclass(frozen=True, kw_only=True)
+class Sighting(EventData):
+    """The corners of one frame or more that were captured together."""
+
+    corners_px: Float[np.ndarray, "C M 4 2"]
+    visible: Bool[np.ndarray, "C M"]
+    sigma_px: Float[np.ndarray, "C M 4"]
+
+    def hiding(self, hidden: Bool[np.ndarray, "#C #M"]) -> "Sighting | None":
+        """The sighting without these views of markers; None where that leaves no marker."""
+        if not (self.visible & hidden).any():
+            return self
         visible = self.visible & ~hidden
         return replace(self, visible=visible) if visible.any() else None
 
@@ -84,22 +94,15 @@ class History:
             new: the entry that `place` has made; the next late event may start from it.
             then: the belief after the new entry.
         """
-        new.belief = then
-        self._entries[-1].belief = belief
-        self._thin()
-        self._forget()
-
-    def _thin(self) -> None:
-        """Drop the reading before the newest if it follows its predecessor too soon."""
-        last = self._entries[-3:]
-        if len(last) == 3 and all(entry.data and entry.data.corners_px is None for entry in last):
-            before, middle, _ = last
-            if middle.stamp_ns - before.stamp_ns < THIN_NS:
-                del self._entries[-2]
-
-    def _forget(self) -> None:
-        """Drop all entries before the belief from which the oldest allowed event can start."""
         entries = self._entries
+        new.belief = then
+        entries[-1].belief = belief
+        # The reading before the newest goes if it follows its predecessor too soon.
+        last = entries[-3:]
+        if len(last) == 3 and all(entry.data and entry.data.corners_px is None for entry in last):
+            if last[1].stamp_ns - last[0].stamp_ns < THIN_NS:
+                del entries[-2]
+        # So does all before the belief from which the oldest allowed event can start.
         oldest_ns = entries[-1].stamp_ns - OLD_NS
         base = 0
         for index, entry in enumerate(entries):
@@ -108,8 +111,3 @@ class History:
             if entry.belief is not None:
                 base = index
         del entries[: max(base, len(entries) - KEPT)]
-
-    @property
-    def newest_ns(self) -> int:
-        """The stamp of the newest event."""
-        return self._entries[-1].stamp_ns

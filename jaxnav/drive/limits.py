@@ -7,9 +7,8 @@ left_mps and turn_radps.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
     from typing_extensions import TypeIs
@@ -19,35 +18,9 @@ if TYPE_CHECKING:  # the guard's process knows a vehicle's numbers without JAX
 Command = tuple[float, ...]
 
 
-class CommandLimits(Protocol):
-    """The limits of one vehicle's commands."""
-
-    @property
-    def zero(self) -> Command:
-        """The command of a vehicle that has never moved."""
-        ...
-
-    def within(self, command: Command, before: Command, elapsed_s: float) -> Command:
-        """The command inside the limits; one that is not finite moves nothing.
-
-        Args:
-            before: the last command.
-            elapsed_s: time since then; 0 replaces a value that is not positive and finite.
-        """
-        ...
-
-    def slowed(self, command: Command, factor: float) -> Command:
-        """The command at a share of its speed."""
-        ...
-
-    def standing(self, command: Command) -> Command:
-        """The command of a vehicle that stands; a car keeps its wheels turned."""
-        ...
-
-
 @dataclass(frozen=True)
 class Limits:
-    """The limits of one car's commands. Implements `CommandLimits`."""
+    """The limits of one car's commands."""
 
     steering_rad: float
     steering_rate_radps: float
@@ -64,34 +37,20 @@ class Limits:
 
     @property
     def zero(self) -> Command:
-        """See `CommandLimits`."""
+        """The command of a vehicle that has never moved."""
         return 0.0, 0.0
 
     def within(self, command: Command, before: Command, elapsed_s: float) -> Command:
-        """See `CommandLimits`."""
-        steering_rad, throttle = command
-        return self.apply(steering_rad, throttle, before[0], elapsed_s)
+        """The command inside the limits.
 
-    def slowed(self, command: Command, factor: float) -> Command:
-        """See `CommandLimits`."""
-        return command[0], command[1] * factor
-
-    def standing(self, command: Command) -> Command:
-        """See `CommandLimits`."""
-        return command[0], 0.0
-
-    def apply(
-        self, steering_rad: float, throttle: float, last_steering_rad: float, elapsed_s: float
-    ) -> tuple[float, float]:
-        """Steering and throttle inside the limits.
-
-        A command that is not finite gives zero throttle; such steering keeps its last value.
+        One that is not finite gives zero throttle; such steering keeps its last value.
 
         Args:
-            last_steering_rad: the steering angle commanded before.
+            before: the last command.
             elapsed_s: time since then; 0 replaces a value that is not positive and finite.
         """
-        last = _clamped(last_steering_rad, self.steering_rad, 0.0)
+        steering_rad, throttle = command
+        last = _clamped(before[0], self.steering_rad, 0.0)
         steering = _clamped(steering_rad, self.steering_rad, last)
         elapsed_s = elapsed_s if math.isfinite(elapsed_s) and elapsed_s > 0 else 0.0
         step = min(self.steering_rate_radps * elapsed_s, 2 * self.steering_rad)
@@ -99,10 +58,18 @@ class Limits:
         drives = math.isfinite(steering_rad) and math.isfinite(throttle)
         return steering, _clamped(throttle, self.throttle, 0.0) if drives else 0.0
 
+    def slowed(self, command: Command, factor: float) -> Command:
+        """The command at a share of its speed."""
+        return command[0], command[1] * factor
+
+    def standing(self, command: Command) -> Command:
+        """The command of a vehicle that stands: a car keeps its wheels turned."""
+        return command[0], 0.0
+
 
 @dataclass(frozen=True)
 class TwistLimits:
-    """The limits of the commands of a base that is driven by a twist; see `CommandLimits`."""
+    """The limits of the commands of a base that is driven by a twist; methods as of `Limits`."""
 
     forward_mps: float
     left_mps: float
@@ -112,34 +79,31 @@ class TwistLimits:
     def of(base: TwistBase) -> TwistLimits:
         """The limits in a base's description."""
         return TwistLimits(
-            float(base.forward_limit_mps),
-            float(base.left_limit_mps),
-            float(base.turn_limit_radps),
+            float(base.forward_limit_mps), float(base.left_limit_mps), float(base.turn_limit_radps)
         )
 
     @property
     def zero(self) -> Command:
-        """See `CommandLimits`."""
+        """See `Limits`."""
         return 0.0, 0.0, 0.0
 
     def within(self, command: Command, before: Command, elapsed_s: float) -> Command:
-        """See `CommandLimits`: each part is cut at its limit; all stand where one is no number."""
+        """See `Limits`: each part is cut at its limit; all stand where one is no number."""
         if not all(map(math.isfinite, command)):
             return self.zero
-        forward, left, turn = command
-        return (
-            _clamped(forward, self.forward_mps, 0.0),
-            _clamped(left, self.left_mps, 0.0),
-            _clamped(turn, self.turn_radps, 0.0),
-        )
+        most = self.forward_mps, self.left_mps, self.turn_radps
+        return tuple(_clamped(*part, 0.0) for part in zip(command, most, strict=True))
 
     def slowed(self, command: Command, factor: float) -> Command:
-        """See `CommandLimits`."""
+        """See `Limits`."""
         return tuple(part * factor for part in command)
 
     def standing(self, command: Command) -> Command:
-        """See `CommandLimits`."""
+        """See `Limits`."""
         return self.zero
+
+
+CommandLimits = Limits | TwistLimits
 
 
 def turns_by_twist(vehicle: Vehicle | TwistBase) -> TypeIs[TwistBase]:
@@ -147,14 +111,9 @@ def turns_by_twist(vehicle: Vehicle | TwistBase) -> TypeIs[TwistBase]:
     return "turn_limit_radps" in vars(vehicle)
 
 
-def limits_of(vehicle: Vehicle | TwistBase) -> Limits | TwistLimits:
+def limits_of(vehicle: Vehicle | TwistBase) -> CommandLimits:
     """The limits in a vehicle's description."""
     return TwistLimits.of(vehicle) if turns_by_twist(vehicle) else Limits.of(vehicle)
-
-
-def limits_from(numbers: Mapping[str, float]) -> Limits | TwistLimits:
-    """The limits of these fields, as another process has sent them."""
-    return TwistLimits(**numbers) if "turn_radps" in numbers else Limits(**numbers)
 
 
 def _clamped(value: float, limit: float, instead: float) -> float:

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxnav.drive.expectation import Expectation
+from jaxnav.drive.expect import Expectation
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.guard import Guard
@@ -93,7 +93,6 @@ class Statistics:
     )
     counts: dict[str, Int[np.ndarray, " bins"]] = field(default_factory=dict)
     deadlines_missed: int = 0
-    handled: int = 0
 
     def add(self, name: str, duration_ms: float) -> None:
         """Count one duration."""
@@ -269,13 +268,11 @@ class Loop:
         end_s = time.perf_counter()
         kind = "odometry" if given.odometry else "frames" if given.frames else "tick"
         self.statistics.add(f"handle {kind}", (end_s - begin_s) * 1e3)
-        self.statistics.handled += 1
         if kind == "frames" and success:
-            self.statistics.add(
-                "frame to command", (self._now_ns() - given.frames[0].stamp_ns) / 1e6
-            )
+            age_ms = (self._now_ns() - given.frames[0].stamp_ns) / 1e6
+            self.statistics.add("frame to command", age_ms)
         self._outcome = outcome
-        self._expectation.update(outcome)
+        self._expectation.update(outcome.output, outcome.belief.bank, outcome.now_ns)
         for observer in self._observers:
             observer.on_outcome(given, outcome)
 

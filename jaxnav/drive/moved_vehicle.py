@@ -7,30 +7,22 @@ vehicle.watch(guard.trip)                        # called when it was stopped th
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import fields
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from jaxnav.drive.corrections import Corrections
-from jaxnav.drive.guard_process import (
-    KIND_FAILED,
-    KIND_READING,
-    Link,
-    command_frame,
-    reading_from,
-)
-from jaxnav.drive.interfaces import GyroReading, Setup
+from jaxnav.drive.interfaces import GyroReading, Setup, reading_of
 from jaxnav.drive.limits import CommandLimits
 from jaxnav.drive.priority import before_siblings
 from jaxnav.errors import BadInput
@@ -45,14 +37,6 @@ _RECEIVES_S = 0.3  # for the spare to receive an order, before another one is st
 _LOOK_S = 0.05
 _LONGEST_LOOK_S = 0.1  # counted of one look: a pause of the whole machine is no silence
 _LATEST_S = 0.03  # the guard looks every 20 ms: its deadline is this much before the timeout
-
-
-class Connected(Protocol):
-    """One end of a socket or pipe."""
-
-    def fileno(self) -> int: ...
-
-    def close(self) -> None: ...
 
 
 class GuardProcess:
@@ -78,7 +62,7 @@ class GuardProcess:
         self._opens = False
         self._order: dict[str, Any] = {"vehicle": name, "path": import_path()} | (order or {})
         self.spare_pid: int | None = None
-        ours, theirs = zip(*(socket.socketpair() for _ in range(3)), strict=True)
+        ours, theirs = zip(*(Pipe() for _ in range(3)), strict=True)
         # OpenBLAS would allocate memory for a thread per core, and all of it would be locked.
         try:
             self.process = start_python(_MODULE, theirs, {"OPENBLAS_NUM_THREADS": "1"})
@@ -86,8 +70,8 @@ class GuardProcess:
             for end in ours:
                 end.close()
             raise
-        self.commands, self.readings, self.spare = map(Link, ours)
-        self.commands.tell(**self._order)
+        self.commands, self.readings, self.spare = ours
+        self.commands.send(self._order)
 
     def prepare(self, check: Callable[[], None]) -> None:
         """Wait until the plug-in is imported there, or is known to stay here.
@@ -134,14 +118,14 @@ class GuardProcess:
                 "seed": setup.seed,
                 "options": dict(setup.options),
             },
-            "limits": asdict(limits),  # type: ignore[call-overload]
-            "corrections": asdict(Corrections.of(setup.vehicle)),
+            "limits": limits,
+            "corrections": Corrections.of(setup.vehicle),
             "timeout_s": timeout_s,
             "resumes": resumes,
         }
         self._order |= changes
         self._opens = True
-        self.commands.tell(**changes)
+        self.commands.send(changes)
         answer = self._answer(check)
         if "bad" in answer:
             raise BadInput(*answer["bad"].split(": ", 1))
@@ -158,10 +142,10 @@ class GuardProcess:
             Why the vehicle has not heard the stop; None: it has.
         """
         order = self._order | {"only_stops": True}
-        with suppress(EOFError, OSError, ValueError):
-            self.spare.tell(**order)
-            if self.spare.ready(_RECEIVES_S):
-                self.spare.mapping()
+        with suppress(Exception):
+            self.spare.send(order)
+            if self.spare.poll(_RECEIVES_S):
+                self.spare.recv()
                 return _unheard_by(self.spare)
             # It hangs as well: two that hold the vehicle may be one too many.
             if self.spare_pid:
@@ -172,7 +156,7 @@ class GuardProcess:
             return f"no other one can be started: {error.strerror or error}"
         try:
             return _unheard_by(another.commands)
-        except (EOFError, OSError, ValueError):
+        except Exception:
             return f"another one {ending(another.process)}"
         finally:
             another._opens = True  # it goes on until the vehicle hears it
@@ -183,15 +167,15 @@ class GuardProcess:
         if not self._opens:
             self.process.kill()
         for link in (self.commands, self.readings, self.spare):
-            link.socket.close()
+            link.close()
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(1.0)
 
     def _answer(self, check: Callable[[], None]) -> dict[str, Any]:
-        while not self.commands.ready(_LOOK_S):
+        while not self.commands.poll(_LOOK_S):
             check()
         try:
-            answer = self.commands.mapping()
+            answer: dict[str, Any] = self.commands.recv()
         except (EOFError, OSError):
             raise BadInput(
                 f"--car {self.name}", f"the guard's process {ending(self.process)}"
@@ -204,6 +188,7 @@ class MovedVehicle:
     """A vehicle in another process. It sends commands without waiting, and requests readings.
 
     Attributes:
+        timeout_s, over: see `Vehicle` and `Ending`; `over` as sent with the last reading.
         replaced: what befell the guard's process where another one had to stop the vehicle.
         unheard: for a person, after `close`: why the vehicle may not have stopped; None: it has.
     """
@@ -212,12 +197,12 @@ class MovedVehicle:
         self, guarding: GuardProcess, own_timeout_s: float, priority: str, timeout_s: float
     ):
         """See `GuardProcess.open`."""
-        self._guarding, self._own_timeout_s, self.priority = guarding, own_timeout_s, priority
+        self._guarding, self.priority = guarding, priority
+        self.timeout_s = own_timeout_s if own_timeout_s > 0 else math.inf
         self._timeout_ns = int((timeout_s - _LATEST_S) * 1e9)
         self.replaced: str | None = None
         self.unheard: str | None = None
-        self._sequence = 0
-        self._over: str | None = None
+        self.over: str | None = None
         self._gyro: tuple[GyroReading, ...] = ()  # that came with readings, and were not asked for
         self._asked_s: float | None = None  # when the pending reading was requested
         self._stop_s: float | None = None  # when the first stop was
@@ -229,23 +214,12 @@ class MovedVehicle:
         self._late: Callable[[], bool] = lambda: False
         self._reason: tuple[str, bool] | None = None
         self._ended = threading.Event()
-        guarding.readings.socket.settimeout(_READ_S)
         threading.Thread(target=self._listen, name="jaxnav-events", daemon=True).start()
 
     @property
     def pid(self) -> int:
         """The id of the guard's process."""
         return self._guarding.process.pid
-
-    @property
-    def timeout_s(self) -> float:
-        """See `Vehicle`."""
-        return self._own_timeout_s if self._own_timeout_s > 0 else math.inf
-
-    @property
-    def over(self) -> str | None:
-        """See `Ending`; as sent with the vehicle's last reading."""
-        return self._over
 
     def watch(
         self, report: Callable[[str, bool], None], late: Callable[[], bool] = lambda: False
@@ -268,25 +242,21 @@ class MovedVehicle:
         """
         link = self._guarding.readings
         if self._asked_s is None:
-            link.send(b"?")
+            link.send("?")
             self._asked_s = time.monotonic()
+        if not link.poll(_READ_S):
+            raise OSError("no reading within a tick")
         try:
-            answer = link.receive()
-        except TimeoutError:
-            raise OSError("no reading within a tick") from None
+            answer = link.recv()
         except EOFError:
             raise OSError("the guard's process is gone") from None
-        if not answer:
-            raise OSError("no reading within a tick")
         self._asked_s = None
-        kind = answer[-1][:1]
-        if kind != KIND_READING:
-            assert kind == KIND_FAILED
-            raise OSError(answer[-1][1:].decode(errors="replace"))
-        reading, gyro, over = reading_from(answer[-1])
-        self._over = over or None
-        self._gyro += gyro
-        return reading
+        if isinstance(answer, str):
+            raise OSError(answer)
+        read, turns, over = answer
+        self.over = over or None
+        self._gyro += tuple(GyroReading(*turn) for turn in turns)
+        return reading_of(*read)
 
     def read_gyro(self) -> tuple[GyroReading, ...]:
         """See `HasGyro`: what came with the readings since; nothing of a vehicle without one."""
@@ -301,9 +271,8 @@ class MovedVehicle:
         """
         if self._dead or self._closed:
             raise OSError(self._dead or "the vehicle is closed")
-        self._sequence += 1
         deadline_ns = time.monotonic_ns() + self._timeout_ns
-        self._guarding.commands.send(command_frame(self._sequence, deadline_ns, command))
+        self._guarding.commands.send((deadline_ns, tuple(map(float, command))))
 
     def stop(self) -> None:
         """See `Vehicle`: the guard there trips, and repeats the stop until the vehicle hears it.
@@ -320,13 +289,13 @@ class MovedVehicle:
         if self._dead:
             raise OSError(self._dead)
         with suppress(OSError):  # the process is ending: `_listen` sees to it
-            self._guarding.commands.tell(stop="told to stop", late=self._late())
+            self._guarding.commands.send({"stop": "told to stop", "late": self._late()})
 
     def resume(self) -> bool:
         """See `Resuming`: a refusal is reported as another stop."""
         with suppress(OSError):
             if not (self._dead or self._closed):
-                self._guarding.commands.tell(resume=True)
+                self._guarding.commands.send({"resume": True})
                 self._stop_s = self._reason = None  # an answer is due to the next stop
                 return True
         return False
@@ -338,7 +307,7 @@ class MovedVehicle:
             self._close_s = time.monotonic()
             self._stop_s = self._stop_s or self._close_s
             with suppress(OSError):
-                self._guarding.commands.tell(close=True)
+                self._guarding.commands.send({"close": True})
             self._ended.wait()
             self._closed = True
         self._guarding.end()
@@ -362,15 +331,14 @@ class MovedVehicle:
         try:
             while True:
                 due_before_s, due_s = due_s, self._due_s()
-                news = link.ready(_LOOK_S)
+                news = link.poll(_LOOK_S)
                 now_s = time.monotonic()
                 silent_s += min(now_s - looked_s, _LONGEST_LOOK_S)
                 looked_s = now_s
                 if news or due_s is None or due_s != due_before_s:
                     silent_s = 0.0
-                for frame in link.receive() if news else []:
-                    if self._closes(json.loads(frame[1:])):
-                        return None
+                if news and self._closes(link.recv()):
+                    return None
                 answers_s = _DEAF_S if self._stop_s is None else _ANSWERS_S
                 if silent_s > (_CLOSES_S if self._heard else answers_s):
                     return f"the guard's process gave no answer for {silent_s:.1f} s"
@@ -379,18 +347,18 @@ class MovedVehicle:
                         return "the guard's process did not end"
                     self.unheard = f"{self.unheard}; the guard's process still tells it to stop"
                     return None
-        except ValueError:
-            return "the guard's process sent what is no event"
         except (EOFError, OSError):
             with suppress(subprocess.TimeoutExpired):
                 process.wait(1.0)
             return f"the guard's process {ending(process)}"
+        except Exception:  # whatever it is, nothing that it says can be relied on any more
+            return "the guard's process sent what is no event"
 
     def _due_s(self) -> float | None:
         """Since when an answer is due: to the first stop, or to a request for a reading."""
         if self._stop_s is not None:
             return self._stop_s
-        return None if self._guarding.readings.ready(0) else self._asked_s
+        return None if self._guarding.readings.poll() else self._asked_s
 
     def _closes(self, said: dict[str, Any]) -> bool:
         """Take an event; return whether it is the last one."""
@@ -420,15 +388,15 @@ class MovedVehicle:
         self._closed = True
 
 
-def _unheard_by(link: Link) -> str | None:
+def _unheard_by(link: Connection) -> str | None:
     """Wait until a process that only stops says that the vehicle has heard it; else why not.
 
     Raises:
         EOFError: it has ended.
     """
     why, end_s = "no other one has opened it yet", time.monotonic() + _CLOSES_S
-    while link.ready(max(end_s - time.monotonic(), 0.0)):
-        said = link.mapping()
+    while link.poll(max(end_s - time.monotonic(), 0.0)):
+        said = link.recv()
         if said.get("heard") or ("closed" in said and said["unheard"] is None):
             return None
         why = said.get("unheard") or said.get("bad") or said.get("stays") or why
@@ -450,12 +418,12 @@ def import_path() -> list[str]:
 
 
 def start_python(
-    module: str, ends: Sequence[Connected], environment: Mapping[str, str]
+    module: str, ends: Sequence[Any], environment: Mapping[str, str]
 ) -> subprocess.Popen[bytes]:
     """Start a Python that runs a module and nothing of the current folder.
 
     Args:
-        ends: of sockets, which it gets as arguments, and which are closed here.
+        ends: of sockets or pipes, which it gets as arguments, and which are closed here.
 
     Raises:
         OSError: the machine has no room for another process.

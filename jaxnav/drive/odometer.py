@@ -24,10 +24,6 @@ _PULLED_MPS = 0.1  # a change of speed that any encoder shows
 _MAX_GAP_NS = 1_000_000_000
 
 
-_Rest = float | tuple[float, ...]  # what is read beside a speed
-_Reading = tuple[float, _Rest]
-
-
 class Odometers:
     """The judge of all driven parts of a vehicle."""
 
@@ -51,17 +47,12 @@ class Odometers:
             values: all that was read.
             believed, wanted_mps: of each part.
         """
+        nothing = (None,) * len(self.parts)
+        of_parts = driven_mps, believed or nothing, wanted_mps or nothing
         believable, faults = True, Fault(0)
-        for index, part in enumerate(self.parts):
-            taken, fault = part.judge(
-                driven_mps[index],
-                values,
-                stamp_ns,
-                None if believed is None else believed[index],
-                seeing,
-                None if wanted_mps is None else wanted_mps[index],
-                contradicted,
-            )
+        for part, speed_mps, of_part, wanted in zip(self.parts, *of_parts, strict=True):
+            told = speed_mps, values, stamp_ns, of_part, seeing, wanted, contradicted
+            taken, fault = part.judge(*told)
             believable, faults = believable and taken, faults | fault
         return believable, faults
 
@@ -72,9 +63,9 @@ class Odometer:
 
     max_mps: float
     time_constant_s: float
-    last: _Reading | None = None  # the speed, and the rest of the reading, believed
+    last_mps: float | None = None  # believed
     _last_ns: int = 0
-    _raw: _Reading | None = None
+    _raw: tuple[float, tuple[float, ...]] | None = None
     _raw_ns: int = 0
     _repeated: int = 0
     _same_speed: int = 0
@@ -87,7 +78,7 @@ class Odometer:
     def judge(
         self,
         speed_mps: float,
-        rest: _Rest,
+        values: tuple[float, ...],
         stamp_ns: int,
         believed: tuple[float, float] | None,
         seeing: bool,
@@ -97,13 +88,13 @@ class Odometer:
         """Whether to fuse a reading, and the faults of the sensor.
 
         Args:
-            rest: what else was read, the steering of a car; it is only compared.
+            values: all that was read; it is only compared.
             believed: the estimate's speed and its sigma, m/s; None: not known.
             seeing: cameras tell the speed too, so persistent impossible readings stay refused.
             wanted_mps: last commanded; None: by somebody else, who may pull as hard as it goes.
             contradicted: corners have moved for a while, but the reading says that it stands.
         """
-        if self._stuck(speed_mps, rest, stamp_ns, wanted_mps) or contradicted:
+        if self._stuck(speed_mps, values, stamp_ns, wanted_mps) or contradicted:
             return False, Fault.ODOMETRY_STUCK
         if self._possible(speed_mps, stamp_ns, believed, wanted_mps):
             if (
@@ -122,7 +113,7 @@ class Odometer:
             insists = self._refusals > _AGREEING and abs(speed_mps) <= 1.5 * self.max_mps
             if seeing or not insists:
                 return False, Fault(0)
-        self.last, self._last_ns = (speed_mps, rest), stamp_ns
+        self.last_mps, self._last_ns = speed_mps, stamp_ns
         return True, Fault(0)
 
     def _possible(
@@ -136,9 +127,9 @@ class Odometer:
             return False
         reference, sigma = believed or (None, 0.0)
         if reference is None:
-            if self.last is None:
+            if self.last_mps is None:
                 return True
-            reference = self.last[0]
+            reference = self.last_mps
         gap_s = min(max(stamp_ns - self._last_ns, 0), _MAX_GAP_NS) / 1e9
         # The command pulls towards a speed of its own, brakes and friction towards zero.
         done = 1 - math.exp(-gap_s / self.time_constant_s)
@@ -170,7 +161,7 @@ class Odometer:
         return long_enough and abs(off_m) < _PATH_M + _PATH_SHARE * way_m
 
     def _stuck(
-        self, speed_mps: float, rest: _Rest, stamp_ns: int, wanted_mps: float | None
+        self, speed_mps: float, values: tuple[float, ...], stamp_ns: int, wanted_mps: float | None
     ) -> bool:
         """Whether readings repeat too often: all of it, or only the speed although the command has
         changed it meanwhile (a driver without a steering sensor reports the commanded angle)."""
@@ -179,8 +170,8 @@ class Odometer:
         towards_mps = self._pulled_mps if wanted_mps is None else wanted_mps
         self._pulled_mps += done * (towards_mps - self._pulled_mps)
         same_speed = speed_mps != 0 and self._raw is not None and self._raw[0] == speed_mps
-        same = same_speed and self._raw == (speed_mps, rest)
-        self._raw, self._raw_ns = (speed_mps, rest), stamp_ns
+        same = same_speed and self._raw == (speed_mps, values)
+        self._raw, self._raw_ns = (speed_mps, values), stamp_ns
         self._repeated = self._repeated + 1 if same else 0
         self._same_speed = self._same_speed + 1 if same_speed else 0
         least, most = self._pulled_range_mps if same_speed else (math.inf, -math.inf)

@@ -1,5 +1,6 @@
 """Leave out markers that others contradict, and ids that cameras see at contradicting places."""
 
+import math
 from itertools import combinations
 
 import jax
@@ -11,7 +12,7 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.candidates import LEAST_MARKERS
 from jaxnav.core.pose.ippe import ippe_from_rays
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import Sighting
 from jaxnav.drive.standstill import Way, between
 from jaxnav.files.executables import kept
 
@@ -21,8 +22,13 @@ _TOGETHER_NS = 500_000_000  # cameras that take turns look within this time
 # of a camera that is off by 10, or a range that differs by 30 %; and cameras measured by hand.
 _APART_SHARE, _APART_M = 0.3, 0.05
 _SIGMAS = 3.0  # of the noise of both ranges beside it
-_LASTING = 5  # frames after which only cameras that agree give the id back: as `CameraVotes`
+# Frames after which only what agrees gives an id or a vote back: half of those after which the
+# filter gives up, see `max_rejections`.
+_LASTING = 5
 _LONG_AGO_NS = -(1 << 62)
+_OPEN_NS = 1_000_000_000  # this long after a contradiction a camera is judged
+_OFF_RAD = math.radians(5.0)  # less than that the filter learns of a camera
+_FARTHER = 3.0  # than a camera that sees as expected: an estimate that is off itself accuses none
 
 
 class MarkerVotes:
@@ -35,13 +41,12 @@ class MarkerVotes:
         self._ids = ids
         self._times = np.zeros(len(ids), int)
 
-    def count(self, data: EventData, outvoted: Bool[np.ndarray, " M"]) -> None:
+    def count(self, data: Sighting, outvoted: Bool[np.ndarray, " M"]) -> None:
         """Count the votes of a frame.
 
         Args:
             outvoted: (M,), which markers the filter found to be outvoted.
         """
-        assert data.visible is not None
         in_view = data.visible.any(axis=0)
         if in_view.sum() >= LEAST_MARKERS:
             times = self._times + np.where(outvoted, 1, -1) * in_view
@@ -52,17 +57,71 @@ class MarkerVotes:
         """The ids of the markers that have more votes against them than for them."""
         return tuple(self._ids[index] for index in np.flatnonzero(self._times))
 
-    def remove_outvoted(self, data: EventData) -> EventData | None:
+    def remove_outvoted(self, data: Sighting) -> Sighting | None:
         """The data without markers that were often outvoted, if too few are in view to vote.
 
         None where that leaves nothing.
         """
-        assert data.visible is not None
-        in_view = data.visible.any(axis=0)
-        hidden = in_view & (self._times >= _OFTEN)
-        if in_view.sum() >= LEAST_MARKERS or not hidden.any():
-            return data
-        return data.hiding(np.broadcast_to(hidden, data.visible.shape))
+        can_vote = data.visible.any(axis=0).sum() >= LEAST_MARKERS
+        return data if can_vote else data.hiding(self._times[None] >= _OFTEN)
+
+
+class CameraVotes:
+    """The votes against each camera in one drive.
+
+    A camera that was knocked is off by more than the filter learns of one: its frames, and those
+    that it shares with others, fit no pose, and the filter would give up the right one. A vehicle
+    that was carried off is where no camera expects it. So an accusation counts only once another
+    camera has seen markers where they should be, since.
+    """
+
+    def __init__(self, navigator: Navigator):
+        self._names = np.array(navigator.rig.names)
+        axis_px = jax.vmap(lambda camera: camera.axis_px)(navigator.rig.cameras)
+        self._most_px = math.tan(_OFF_RAD) * np.asarray(axis_px).mean(axis=1)
+        count = len(self._names)
+        self._votes = np.zeros(count, int)
+        self._off_px, self._off_ns = np.zeros(count), np.full(count, _LONG_AGO_NS)
+        self._contradicted_ns = _LONG_AGO_NS
+
+    def note_contradiction(self, stamp_ns: int) -> None:
+        """Note corners that the filter did not expect."""
+        self._contradicted_ns = stamp_ns
+
+    def open(self, stamp_ns: int) -> bool:
+        """Whether there is anything to vote on: only then are corners projected for `count`."""
+        return stamp_ns - self._contradicted_ns < _OPEN_NS or bool(self._outvoted.any())
+
+    def count(self, data: Sighting, due_px: Float[np.ndarray, "C M 4 2"], stamp_ns: int) -> None:
+        """Count the votes of a frame.
+
+        Args:
+            due_px: where they should be by the estimate.
+        """
+        visible = data.visible
+        apart_px = np.linalg.norm(data.corners_px - due_px, axis=3).max(axis=2)
+        off_px = np.where(visible, apart_px, 0).max(axis=1)
+        in_view, off = visible.any(axis=1), ~(off_px <= self._most_px)
+        self._off_px[off], self._off_ns[off] = off_px[off], stamp_ns
+        as_expected = in_view & ~off
+        if as_expected.any():
+            recent = np.abs(stamp_ns - self._off_ns) < _TOGETHER_NS
+            accused = recent & ~(self._off_px <= _FARTHER * off_px[as_expected].min())
+            self._votes = np.clip(self._votes + accused - as_expected, 0, 2 * _LASTING)
+            self._off_ns[recent] = _LONG_AGO_NS
+
+    @property
+    def outvoted(self) -> tuple[str, ...]:
+        """The names of the cameras without a vote."""
+        return tuple(self._names[self._outvoted].tolist())
+
+    def remove_outvoted(self, data: Sighting) -> Sighting | None:
+        """The data without these cameras; None where that leaves nothing."""
+        return data.hiding(self._outvoted[:, None])
+
+    @property
+    def _outvoted(self) -> Bool[np.ndarray, " C"]:
+        return self._votes >= _LASTING
 
 
 @kept
@@ -122,20 +181,17 @@ class Twins:
         return max(self._last_ns)
 
     def remove_twins(
-        self, data: EventData, stamp_ns: int, way: Way, judged: bool = False
-    ) -> EventData | None:
+        self, data: Sighting, stamp_ns: int, way: Way, judged: bool = False
+    ) -> Sighting | None:
         """The data without ids at contradicting places; None where that leaves nothing.
 
         Args:
             way: of the vehicle by its odometer, which has moved between looks.
             judged: a sure estimate judges contradictions.
         """
-        assert data.corners_px is not None
-        assert data.visible is not None
         visible = data.visible
         if len(visible) < 2:
             return data
-        assert data.sigma_px is not None
         lanes = np.argwhere(visible).tolist()
         for camera, marker in lanes:
             self._corners_px[camera, marker] = data.corners_px[camera, marker]
@@ -156,7 +212,7 @@ class Twins:
             votes >= _LASTING or abs(stamp_ns - last_ns) < _TOGETHER_NS
             for votes, last_ns in zip(self._votes, self._last_ns, strict=True)
         ]
-        return data.hiding(np.broadcast_to(twins, visible.shape)) if any(twins) else data
+        return data.hiding(np.array(twins)[None])
 
     def place_m(self, camera: int, marker: int) -> list[float]:
         """Where a sighting has its marker; known while several cameras are in view."""

@@ -121,9 +121,7 @@ class PackedLayout:
 
 
 @partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("floats", "integers"),
-    meta_fields=("layout",),
+    jax.tree_util.register_dataclass, data_fields=("floats", "integers"), meta_fields=("layout",)
 )
 @dataclass(frozen=True)
 class Packed:

@@ -24,7 +24,6 @@ from jaxnav.core.models.origin import ZERO, Origin, planar_in_world, poses_in_wo
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.core.pose.refine import Candidates
 from jaxnav.drive.actuation import Actuation
-from jaxnav.drive.camera_votes import CameraVotes
 from jaxnav.drive.chassis import chassis_of, pace_mps, root_of_sum
 from jaxnav.drive.compiled_step import strip_static
 from jaxnav.drive.corrections import Corrections
@@ -32,19 +31,17 @@ from jaxnav.drive.estimator import Estimator, Program, gyro_of
 from jaxnav.drive.expect import Place, due_px, quads_px
 from jaxnav.drive.flags import Fault, Health, Reject
 from jaxnav.drive.frames import FrameDetections, FrameIntake
-from jaxnav.drive.gyro_track import GyroTrack
+from jaxnav.drive.gyro import TurnVotes
 from jaxnav.drive.health import RESTARTS_S, SPEED_FACTOR, Monitor, Senses, Timeouts
-from jaxnav.drive.history import EventData
+from jaxnav.drive.history import EventData, Sighting
 from jaxnav.drive.interfaces import GyroReading, Reading
-from jaxnav.drive.leaving import Corridor
 from jaxnav.drive.limits import Command
 from jaxnav.drive.odometer import Odometers
-from jaxnav.drive.outvoted import MarkerVotes, Twins
+from jaxnav.drive.outvoted import CameraVotes, MarkerVotes, Twins
 from jaxnav.drive.stamps import Stamps
 from jaxnav.drive.standstill import Standstill, Way, between
 from jaxnav.drive.support import Support
-from jaxnav.drive.turn_votes import TurnVotes
-from jaxnav.drive.ways import Fix
+from jaxnav.drive.ways import Corridor, Fix
 from jaxnav.files.poses import rotated
 
 SLEPT_NS = 1_000_000_000  # after a pause this long in the loop, its belief is out of date
@@ -185,13 +182,9 @@ class Pilot:
         self.limits = self._chassis.limits
         self._corrections = Corrections.of(navigator.controller.vehicle)
         gyro = gyro_of(navigator)
-        self._gyro = None if gyro is None else GyroTrack(float(gyro.saturation_radps))
-        mean_radps = None if self._gyro is None else self._mean_radps
+        self._turns = None if gyro is None else TurnVotes(self._chassis, gyro)
+        mean_radps = None if self._turns is None else self._turns.mean_radps
         self._estimator = Estimator(navigator, program, mean_radps)
-        self._turns: TurnVotes | None = None
-        if self._gyro is not None and gyro is not None:
-            bias_radps = float(gyro.bias_sigma_radps)
-            self._turns = TurnVotes(self._chassis, bias_radps, self._gyro.mean_radps)
         self._frames = FrameIntake(len(navigator.rig), navigator.markers, corner_sigma_px)
         self._monitor = Monitor(timeouts or Timeouts())
         self._drives = drives
@@ -232,24 +225,17 @@ class Pilot:
     def handle(self, given: Input) -> Outcome:
         """Fuse an input, frames first. `now_ns` must not be less than in the input before."""
         now_ns, faults = given.now_ns, given.faults | self._slept(given.now_ns)
-        if self._gyro is not None:
-            faults |= self._gyro.take(given.gyro, now_ns)
+        if self._turns is not None:
+            faults |= self._turns.track.take(given.gyro, now_ns)
         frames = [self._corrections.correct_frame(frame) for frame in given.frames]
         data, stamp_ns, seen_faults = self._frames.check(frames, now_ns, self._frozen)
         faults |= seen_faults
         if data is not None:
-            self._judge_cameras(data, stamp_ns)
-            data = self._camera_votes.remove_outvoted(data)
-        if data is not None:
-            # By an estimate that has agreed with a way a knocked camera is told from a copy.
-            judged = self._sure and self._support.ranges.agreed
-            data = self._twins.remove_twins(data, stamp_ns, self._standstill.way, judged)
+            data = self._without_outvoted(data, stamp_ns)
         if self._twins.seen(now_ns):
             faults |= Fault.DUPLICATE_MARKER
         if data is not None:
-            data = self._marker_votes.remove_outvoted(data)
-        if data is not None:
-            outcome = self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
+            outcome = self._fuse(data, stamp_ns, now_ns, faults)
         if given.odometry is not None:
             return self._odometry(self._corrections.correct_reading(given.odometry), now_ns, faults)
         return outcome if data is not None else self._tick(now_ns, faults)
@@ -292,13 +278,18 @@ class Pilot:
         self._odometer_ns = max(stamp_ns, self._odometer_ns or 0)
         self._standstill.add_believed(stamp_ns, now_ns, pace, motion)
         data = EventData(odometry=reading.values)
-        return self._fuse(data, stamp_ns, now_ns, faults, _NO_REJECT)
+        return self._fuse(data, stamp_ns, now_ns, faults)
 
     def _tick(self, now_ns: int, faults: Fault, rejects: Reject = _NO_REJECT) -> Outcome:
         return self._fuse(None, now_ns, now_ns, faults, rejects)
 
     def _fuse(
-        self, data: EventData | None, stamp_ns: int, now_ns: int, faults: Fault, rejects: Reject
+        self,
+        data: EventData | None,
+        stamp_ns: int,
+        now_ns: int,
+        faults: Fault,
+        rejects: Reject = _NO_REJECT,
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(data, stamp_ns, now_ns, elapsed_ns)
@@ -309,7 +300,8 @@ class Pilot:
             self._begin_anew("the estimate was no number")
         if fused.refused:
             rejects |= Reject.TOO_LATE
-        if data is not None and data.corners_px is not None and fused.refused:
+        seen = data if isinstance(data, Sighting) else None
+        if seen is not None and fused.refused:
             self._frames.forget_last()
         restarts = self._restarts_before + int(fused.belief.restarts)
         if finite and restarts > self._restarts:
@@ -321,20 +313,22 @@ class Pilot:
             self._actuation.forget_place()
             if self._turns is not None:
                 self._turns.forget()
-        if data is not None and data.corners_px is not None and not fused.refused:
-            self._marker_votes.count(data, np.asarray(fused.output.outvoted))
+        if seen is not None and not fused.refused:
+            self._marker_votes.count(seen, np.asarray(fused.output.outvoted))
             candidates = vars(fused.output)["candidates"]
-            self._add_place(data, stamp_ns, candidates)
+            self._add_place(seen, stamp_ns, candidates)
             rejects |= self._judge(known, fused.belief, candidates, stamp_ns, now_ns)
         doubts = self._support.faults
         if self._drives:
             doubts |= self._actuation.faults
         faults |= doubts
-        if self._turns is not None and self._turns.gyro_is_wrong:
-            faults |= Fault.GYRO_CONTRADICTED
+        if self._turns is not None:
+            faults |= Fault.GYRO_CONTRADICTED if self._turns.gyro_is_wrong else _NO_FAULT
+            stale = self._age_s(self._turns.track.newest_ns, now_ns) > GYRO_STALE_S
+            faults |= Fault.GYRO_STALE if stale else _NO_FAULT
         markers, cameras = self._marker_votes.outvoted, self._camera_votes.outvoted
-        faults |= Fault.MARKER_OUTVOTED if markers else Fault(0)
-        faults |= Fault.CAMERA_OUTVOTED if cameras else Fault(0)
+        faults |= Fault.MARKER_OUTVOTED if markers else _NO_FAULT
+        faults |= Fault.CAMERA_OUTVOTED if cameras else _NO_FAULT
         # A fix since then is by other ids.
         self._on_twins = self._twins.seen(now_ns) and (self._fix_ns or 0) < self._twins.last_ns
         placed = known.decided and self._support.confirmed and not self._on_twins
@@ -349,8 +343,6 @@ class Pilot:
         self._known, self._now_ns = known, now_ns
         if self._standstill.nothing_moves:
             faults |= Fault.NOTHING_MOVES
-        if self._gyro is not None and self._age_s(self._gyro.newest_ns, now_ns) > GYRO_STALE_S:
-            faults |= Fault.GYRO_STALE
         health, faults = self._monitor.look(self._senses(known, now_ns, faults))
         factor = 0.0 if Fault.HELD in faults else SPEED_FACTOR[health]
         command = self._limited(known, factor, now_ns, elapsed_ns)
@@ -401,13 +393,11 @@ class Pilot:
         alive = zip(*planar_poses(bank), bank.initialised, strict=True)
         support = self._support
         before = support.relocations, support.refused
-        if support.add_corners(
-            known.accepted,
-            agrees,
-            now_ns,
-            fix,
-            lambda: [_fix(pose, covariance) for pose, covariance, lives in alive if lives],
-        ):
+
+        def possible() -> list[Fix]:
+            return [_fix(pose, covariance) for pose, covariance, lives in alive if lives]
+
+        if support.add_corners(known.accepted, agrees, now_ns, fix, possible):
             self._fix_ns, self._distance_m = max(stamp_ns, self._fix_ns or 0), 0.0
         if support.relocations > before[0] or support.refused > before[1]:
             what = "refused" if support.refused else "relocated"
@@ -417,9 +407,8 @@ class Pilot:
             return Reject.INNOVATION
         return Reject.INNOVATION_LARGE if known.nis > known.gate_nis / 2 else _NO_REJECT
 
-    def _add_place(self, data: EventData, stamp_ns: int, candidates: Candidates) -> None:
+    def _add_place(self, data: Sighting, stamp_ns: int, candidates: Candidates) -> None:
         """Watch how the range of a marker in view changes; see `Ranges`."""
-        assert data.visible is not None
         valid = np.asarray(candidates.valid)
         best = int(np.argmin(np.where(valid, candidates.cost, np.inf)))
         then_ns, way = self._look_ns, self._standstill.way
@@ -440,24 +429,28 @@ class Pilot:
         if self._support.ranges.add_place(self._lane, place_m, motion):
             self._look_ns = stamp_ns
 
-    def _judge_cameras(self, data: EventData, stamp_ns: int) -> None:
-        """Let a sure estimate vote on the cameras in view; see `CameraVotes`."""
-        known = self._known
-        if self._sure and known is not None and self._camera_votes.open(stamp_ns):
-            x_m, y_m, psi_rad = known.pose.tolist()
-            due_px = quads_px(self._unnamed, (x_m, y_m, psi_rad))
-            self._camera_votes.count(data, due_px, stamp_ns)
+    def _without_outvoted(self, data: Sighting, stamp_ns: int) -> Sighting | None:
+        """What is left of a frame without views that others contradict; None: nothing."""
+        known, votes = self._known, self._camera_votes
+        if self._sure and known is not None and votes.open(stamp_ns):
+            votes.count(data, quads_px(self._unnamed, known.pose), stamp_ns)
+        left = votes.remove_outvoted(data)
+        if left is not None:
+            # By an estimate that has agreed with a way a knocked camera is told from a copy.
+            judged = self._sure and self._support.ranges.agreed
+            left = self._twins.remove_twins(left, stamp_ns, self._standstill.way, judged)
+        return None if left is None else self._marker_votes.remove_outvoted(left)
 
     def _honest(self, output: Output, known: _Known) -> tuple[Output, _Known]:
         """The estimate to report: an unconfirmed one is not decided, its covariance is widened."""
         disobeyed = self._drives and bool(self._actuation.faults)
         contradicted = self._monitor.contradicted or disobeyed or self._on_twins
-        doubt = self._support.doubt(contradicted)
-        if not (doubt.is_doubted and known.decided):
+        doubt_m = self._support.doubt_m(contradicted)
+        if doubt_m is None or not known.decided:
             return output, known
         covariances = [np.array(output.pose_covariance), np.array(output.covariance)]
         for covariance in covariances:
-            covariance[[0, 1], [0, 1]] += doubt.off_m**2 / 2
+            covariance[[0, 1], [0, 1]] += doubt_m**2 / 2
         honest: Output = eqx.tree_at(
             lambda output: (output.decided, output.pose_covariance, output.covariance),
             output,
@@ -501,9 +494,9 @@ class Pilot:
         return max(now_ns - stamp_ns, 0) / 1e9
 
     def _due_px(self, motion: Place) -> tuple[np.ndarray, np.ndarray] | None:
-        """See `due_px`."""
+        """See `due_px`; None where the pose is not known."""
         known = self._known
-        return due_px(self._unnamed, known.pose if known and known.located else None, motion)
+        return due_px(self._unnamed, known.pose, motion) if known and known.located else None
 
     def _slept(self, now_ns: int) -> Fault:
         """Start anew if the loop paused for so long that its belief is out of date."""
@@ -526,12 +519,6 @@ class Pilot:
         self._restarts_before, self._restart_reason = self._restarts, reason
         self._fix_ns, self._distance_m = None, 0.0
         self._left = self._known
-
-    def _mean_radps(self, begin_ns: int, end_ns: int) -> float:
-        """What the gyro tells of the interval between two times; NaN: nothing, or it is wrong."""
-        assert self._gyro is not None
-        assert self._turns is not None
-        return math.nan if self._turns.gyro_is_wrong else self._gyro.mean_radps(begin_ns, end_ns)
 
     def _seeing(self, now_ns: int) -> bool:
         """Whether recent corners tell how fast the vehicle is."""

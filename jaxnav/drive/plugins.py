@@ -30,23 +30,19 @@ _COMES_WITH = {
 }
 
 
-def open_vehicle(name: str, setup: Setup) -> Vehicle:
+def open_vehicle(name: str, setup: Setup, factory: Callable[..., Any] | None = None) -> Vehicle:
     """Open a vehicle.
 
     Args:
         name: name of an entry point, or `module:name`.
+        factory: what `load_factory` has found before; None: it is looked for.
 
     Raises:
         BadInput: there is none of that name, it can't be imported or opened, or it does not return
             a vehicle.
     """
-    return opened_vehicle(name, load_factory("--car", VEHICLES, name), setup)
-
-
-def opened_vehicle(name: str, factory: Callable[..., Any], setup: Setup) -> Vehicle:
-    """Like `open_vehicle`, with a factory that was found before."""
     flag = "--car"
-    vehicle: Vehicle = _opened(flag, name, factory, setup)
+    vehicle: Vehicle = _opened(flag, name, factory or load_factory(flag, VEHICLES, name), setup)
     if lacking := missing_members(vehicle, Vehicle):
         _close([vehicle])
         raise BadInput(flag, f"{name} gives {_what(vehicle)}, which has no {_listed(lacking)}")
@@ -68,10 +64,17 @@ def open_cameras(name: str, setup: Setup, vehicle: Vehicle | None) -> tuple[Came
     if not isinstance(product, Sequence) or isinstance(product, str | bytes):
         _close([product])
         raise BadInput(flag, f"{name} gives {_what(product)}, expected a sequence of cameras")
-    cameras = tuple(product)
-    if problem := _wrong_with(cameras, setup.rig.names):
+    cameras, names, problem = tuple(product), setup.rig.names, ""
+    for index, camera in enumerate(cameras):
+        if lacking := missing_members(camera, Camera):
+            problem = f"{_what(camera)} as camera {index}, which has no {_listed(lacking)}"
+            break
+    else:
+        if (given := tuple(camera.name for camera in cameras)) != names:
+            problem = f"the cameras {_listed(given)}, expected those of the rig: {_listed(names)}"
+    if problem:
         _close(cameras)
-        raise BadInput(flag, f"{name} {problem}")
+        raise BadInput(flag, f"{name} gives {problem}")
     return cameras
 
 
@@ -106,7 +109,12 @@ def load_factory(flag: str, group: str, name: str) -> Callable[..., Any]:
             f"there is no {name!r}: expected {', '.join(sorted(installed)) or 'an installed name'}"
             " or module:name",
         )
-    member: Any = _imported(flag, name, module)
+    try:
+        member: Any = importlib.import_module(module)
+    except ImportError as error:
+        raise _not_importable(flag, name, error) from error
+    except (Exception, SystemExit) as error:  # it is foreign code
+        raise BadInput(flag, f"{name}: importing {module} failed: {_said(error)}") from error
     for part in attribute.split("."):
         if not hasattr(member, part):
             raise BadInput(flag, f"{name}: the module {module} has no {attribute!r}")
@@ -129,15 +137,6 @@ def missing_members(opened: object, protocol: type) -> list[str]:
     return lacking
 
 
-def _imported(flag: str, name: str, module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise _not_importable(flag, name, error) from error
-    except (Exception, SystemExit) as error:  # it is foreign code
-        raise BadInput(flag, f"{name}: importing {module} failed: {_said(error)}") from error
-
-
 def _opened(flag: str, name: str, factory: Callable[..., Any], *args: object) -> Any:
     try:
         return factory(*args)
@@ -156,16 +155,6 @@ def _not_importable(flag: str, name: str, error: ImportError) -> BadInput:
     top = error.name.partition(".")[0]
     hint = _COMES_WITH.get(top, "is it installed, or its folder on PYTHONPATH?")
     return BadInput(flag, f"{name} needs the module {error.name}, which is missing: {hint}")
-
-
-def _wrong_with(cameras: tuple[Any, ...], names: tuple[str, ...]) -> str:
-    for index, camera in enumerate(cameras):
-        if lacking := missing_members(camera, Camera):
-            return f"gives {_what(camera)} as camera {index}, which has no {_listed(lacking)}"
-    given = tuple(camera.name for camera in cameras)
-    if given != names:
-        return f"gives the cameras {_listed(given)}, expected those of the rig: {_listed(names)}"
-    return ""
 
 
 def _close(things: Sequence[Any]) -> None:

@@ -9,11 +9,11 @@ found where it should be.
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxnav.core.models.camera import Camera as CameraModel
 from jaxnav.detection.families import marker_cells, printed
@@ -21,6 +21,7 @@ from jaxnav.detection.signs_of_life import telling
 from jaxnav.detection.track import warm_up_fits
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
+from jaxnav.drive.expect import Region
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FROZEN_AFTER, FrameDetections
 from jaxnav.drive.guard import Guard
@@ -44,28 +45,6 @@ class SearchedFrame:
     sighted: FrameDetections
     frame: Frame
     camera_name: str
-
-
-@dataclass(frozen=True)
-class Region:
-    """The expected places of K markers in an image.
-
-    Attributes:
-        quads_px: (K, 4, 2), corners, TL TR BR BL.
-        radius_px: (K,), search radii.
-        keys: family and id of each marker; left out, none of them is followed.
-        flow_px_s: (K, 2), velocities of their centres in the image; None if nobody knows them.
-        stamp_ns: the time at which they are expected there; None: that of the image.
-        decided: False: they are expected by one hypothesis or another, a marker perhaps in several
-            places, and the whole image is searched as well.
-    """
-
-    quads_px: Float[np.ndarray, "K 4 2"]
-    radius_px: Float[np.ndarray, " K"]
-    keys: tuple[tuple[str, int], ...] = ()
-    flow_px_s: Float[np.ndarray, "K 2"] | None = None
-    stamp_ns: int | None = None
-    decided: bool = True
 
 
 class Search:
@@ -139,10 +118,18 @@ class Search:
         if region is not None and near:
             if not len(region.quads_px):
                 return FrameDetections(self._camera, frame.stamp_ns, _NONE)
-            detections = self._followed(frame, region, self._near(frame.image, region))
+            parts = [
+                detector.detect_near(frame.image, self._model, region.quads_px, region.radius_px)
+                for detector in self._detectors
+                if isinstance(detector, RegionDetector)
+            ]
+            detections = self._followed(frame, region, Detections.concatenate(parts))
         if not len(detections):
             self._since_whole = 0
-            detections = self._everywhere(frame.image, region)
+            quads_px = None if region is None else region.quads_px
+            detections = Detections.concatenate(
+                [one.detect(frame.image, self._model, quads_px) for one in self._detectors]
+            )
             if region is not None and not near:  # else none of them could be followed just now
                 detections = self._followed(frame, region, detections)
         return FrameDetections(self._camera, frame.stamp_ns, detections)
@@ -154,14 +141,6 @@ class Search:
         self._pictures = self._pictures + 1 if picture == self._picture else 1
         self._picture = picture
         return self._pictures >= FROZEN_AFTER
-
-    def _near(self, image: np.ndarray, region: Region) -> Detections:
-        parts = [
-            detector.detect_near(image, self._model, region.quads_px, region.radius_px)
-            for detector in self._detectors
-            if isinstance(detector, RegionDetector)
-        ]
-        return Detections.concatenate(parts)
 
     def _followed(self, frame: Frame, region: Region, detections: Detections) -> Detections:
         """The detections, and the expected markers that were followed without being decoded."""
@@ -182,12 +161,6 @@ class Search:
         )
         return Detections.concatenate([detections, followed])
 
-    def _everywhere(self, image: np.ndarray, region: Region | None) -> Detections:
-        quads_px = None if region is None else region.quads_px
-        return Detections.concatenate(
-            [detector.detect(image, self._model, quads_px) for detector in self._detectors]
-        )
-
 
 def _told(name: str, value: float | None) -> float | None:
     """A time that a driver tells; None where no camera can have it. A short exposure may be 0."""
@@ -196,11 +169,9 @@ def _told(name: str, value: float | None) -> float | None:
 
 def image_fault(image: np.ndarray | None, size_px: tuple[int, int]) -> Fault:
     """The fault of an image that can't be searched; `Fault(0)` if it can."""
-    if image is None or not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         return Fault.FRAME_UNUSABLE
-    if image.ndim not in (2, 3) or image.shape[1::-1] != tuple(size_px):
-        return Fault.FRAME_UNUSABLE
-    if image.ndim == 3 and image.shape[2] != 3:
+    if image.shape[1::-1] != tuple(size_px) or image.shape[2:] not in ((), (3,)):
         return Fault.FRAME_UNUSABLE
     flat = float(np.std(image[::_SAMPLE, ::_SAMPLE])) < _MIN_SPREAD
     return Fault.FRAME_UNUSABLE if flat else Fault(0)
@@ -210,11 +181,7 @@ class Eyes:
     """The cameras of a rig, with the threads that read and search them."""
 
     def __init__(
-        self,
-        cameras: Sequence[Camera],
-        searches: Sequence[Search],
-        guard: Guard,
-        workers: int = 2,
+        self, cameras: Sequence[Camera], searches: Sequence[Search], guard: Guard, workers: int = 2
     ):
         """Args:
         searches: one for each camera.
@@ -237,8 +204,8 @@ class Eyes:
         ]
         turns += [(f"detector {number}", self._look) for number in range(workers)]
         self._threads = [
-            threading.Thread(target=self._repeat, args=(turn, name), name=name, daemon=True)
-            for name, turn in turns
+            threading.Thread(target=self._repeat, args=turn, name=turn[0], daemon=True)
+            for turn in turns
         ]
 
     def start(self) -> None:
@@ -266,15 +233,13 @@ class Eyes:
         with self._waiting:
             self._waiting.notify_all()
         for camera in self._cameras:
-            try:
+            with suppress(OSError):
                 camera.close()
-            except OSError:
-                continue
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(0.5)
 
-    def _repeat(self, turn: Callable[[], None], name: str) -> None:
+    def _repeat(self, name: str, turn: Callable[[], None]) -> None:
         """Take turns until the end, watched by the guard. Runs in a thread."""
         beat = partial(self._guard.beat, name)
         try:
@@ -301,8 +266,7 @@ class Eyes:
                 self._waiting.notify()
 
     def _look(self) -> None:
-        task = self._next()
-        if task is None:
+        if (task := self._next()) is None:
             return
         index, frame = task
         try:

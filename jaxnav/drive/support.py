@@ -1,11 +1,5 @@
 """Check what supports an estimate, and so decide whether to act on it.
 
-    # With each reading:
-    support.add_odometry(driven_mps, motion, heading_rad, gap_s, wanted_mps, seeing)
-    support.ranges.add_place(lane, place_m, motion)  # with every frame that shows markers
-    is_fix = support.add_corners(accepted, agrees, now_ns, fix, possible)  # with every frame
-    support.doubt(contradicted)
-
 The filter can't know that its pose is wrong: all data were fused into it. So a pose is trusted only
 after CONFIRMED frames in a row have fitted it, and only until corners, or odometer and throttle,
 contradict it. After a restart the pose is compared with the way of the wheels since the last fix: a
@@ -13,11 +7,10 @@ copy of the marker elsewhere looks like the marker.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
+from jaxnav.drive.actuation import Propulsion
 from jaxnav.drive.chassis import Chassis, Motion, pace_mps
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.propulsion import Propulsion
 from jaxnav.drive.ways import Fix, Ranges, Ways
 
 CONFIRMED = 2  # frames in a row, with the first: a single one never confirms
@@ -27,13 +20,6 @@ SLOW_M = 1.0
 # Every further restart on that way needs twice as many frames, up to three seconds of a camera's.
 _MOST_CONFIRMED = 96
 _NO_FAULT = Fault(0)
-
-
-class Doubt(NamedTuple):
-    """Whether to doubt an estimate, and its possible error beside its sigma."""
-
-    is_doubted: bool
-    off_m: float
 
 
 class Support:
@@ -162,8 +148,8 @@ class Support:
         self._ways.add_fix(now_ns, fix)
         return True
 
-    def doubt(self, contradicted: bool) -> Doubt:
-        """The doubt about the estimate.
+    def doubt_m(self, contradicted: bool) -> float | None:
+        """By how much the estimate may be off beside its sigma; None: it is not doubted.
 
         Args:
             contradicted: the corners contradict it more often than not.
@@ -174,7 +160,7 @@ class Support:
             off_m += self._ways.since_fix_m
         contradicted |= self.ranges.contradicted
         is_doubted = not self.confirmed or self.refused or contradicted or doubtful
-        return Doubt(is_doubted, off_m)
+        return off_m if is_doubted else None
 
     @property
     def _doubtful(self) -> bool:

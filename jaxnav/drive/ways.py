@@ -1,10 +1,5 @@
 """Compare the vehicle's way by the corners with its way by the odometer.
 
-    ways.add_odometry(motion, pace_mps, heading_rad, gap_s)   # with every odometry
-    ways.note_corners(now_ns)                             # with every frame that shows markers
-    ways.add_fix(now_ns, fix)                             # with every pose to be trusted
-    ways.out_of_reach(fix)                                # before that
-
 A marker that is carried along, or a copy of it elsewhere, fits its own corners as well as the true
 one does. It can't imitate the odometer: the car has not gone where the corners say. There are two
 measures, since a slow drag is hidden by wheel slip and a leap is not:
@@ -16,10 +11,6 @@ measures, since a slow drag is hidden by wheel slip and a leap is not:
 Neither detects a copy carried slower than DRIFT_SHARE of the car's own speed or by less than the
 two margins, or one that was there from the beginning.
 
-    ranges.add_way(way_m)                                 # with every odometry
-    ranges.add_place(lane, place_m, motion)               # with every frame that shows markers
-    ranges.contradicted, ranges.lasting
-
 How fast a marker comes nearer needs no estimate: neither of a pose, nor of which of two it is. A
 marker or a focal length that is s times as large as its file says makes every range s times as
 long, wheels make every way so, and a camera that looks the other way sees a marker go that comes.
@@ -29,7 +20,11 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
 
 from jaxnav.drive.chassis import Motion
 
@@ -300,6 +295,22 @@ class Ranges:
             self._weight, self._free, self._sums = 0.0, 0.0, (0.0, 0.0, 0.0)
 
 
+class Corridor:
+    """All that is within a distance of a drive's route: the way past all waypoints."""
+
+    def __init__(self, waypoints_m: Sequence[Sequence[float]] | np.ndarray, leave_m: float):
+        # Complex: of few legs NumPy takes ten times as long as plain numbers.
+        self._waypoints_m = [complex(x, y) for x, y in np.asarray(waypoints_m, float).tolist()]
+        self._leave_m, self._route_m = leave_m, list[complex]()
+
+    def is_left(self, place_m: Float[np.ndarray, " 2"]) -> bool:
+        """Whether a place is outside; the first one asked about is where the route begins."""
+        here_m = complex(*place_m.tolist())
+        self._route_m = self._route_m or [here_m, *self._waypoints_m]
+        legs_m = pairwise(self._route_m)
+        return all(_off_m(here_m - begin, end - begin) > self._leave_m for begin, end in legs_m)
+
+
 def _part_m(one: _Anchor, other: _Anchor) -> float:
     return math.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
 
@@ -311,3 +322,9 @@ def _parts(here: _Anchor, then: _Anchor) -> bool:
 
 def _agrees(here: _Anchor, then: _Anchor) -> bool:
     return _part_m(here, then) <= _AGREES_M + DRIFT_SHARE / 2 * (here.way_m - then.way_m)
+
+
+def _off_m(place_m: complex, leg_m: complex) -> float:
+    """How far a place is from a leg; both count from where the leg begins."""
+    share = (place_m * leg_m.conjugate()).real / max(abs(leg_m) ** 2, 1e-12)
+    return abs(place_m - min(max(share, 0.0), 1.0) * leg_m)

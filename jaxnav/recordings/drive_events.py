@@ -23,7 +23,7 @@ from jaxnav.drive.chassis import chassis_of
 from jaxnav.drive.corrections import Corrections
 from jaxnav.drive.flags import Reject
 from jaxnav.drive.frames import FrameIntake
-from jaxnav.drive.gyro_track import GyroTrack
+from jaxnav.drive.gyro import GyroTrack
 from jaxnav.drive.history import EventData
 from jaxnav.drive.pilot import Input
 from jaxnav.drive.stamps import OLD_NS, Stamps

@@ -184,8 +184,8 @@ class QCarVehicle:
             stops = self._stops
             now_ns = time.monotonic_ns()
             before_ns = now_ns if self._written_ns is None else self._written_ns
-            self._steering_rad, self._throttle = self._limits.apply(
-                steering_rad, throttle, self._steering_rad, (now_ns - before_ns) / 1e9
+            self._steering_rad, self._throttle = self._limits.within(
+                (steering_rad, throttle), (self._steering_rad, 0.0), (now_ns - before_ns) / 1e9
             )
             self._written_ns = now_ns
             self._servo.turn_to(self._steering_rad, now_ns)

@@ -2,7 +2,6 @@
 to the servo; a vehicle without calibration changes no bit."""
 
 import dataclasses
-import math
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,7 @@ from jaxnav.vehicles.conformance.lockstep import BEGIN_NS
 from jaxnav.vehicles.sim import SimVehicle
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
+from tests.drive.test_guard import Car
 from tests.helpers.simulated import make_setup, simulated
 
 CORRECTIONS = {
@@ -86,38 +86,18 @@ def test_without_a_calibration_nothing_is_touched(speed_mps, steering_rad, stamp
 
 def test_the_servo_turns_no_further_than_its_limit():
     corrections = Corrections.of(vehicle(steering_gain=0.5))
-    assert corrections.servo_rad(0.5) == 0.5
-    assert corrections.servo_rad(-0.5) == -0.5
-    assert corrections.servo_rad(0.02) == 0.0
+    assert [corrections.servo_rad(rad) for rad in (0.5, -0.5, 0.02)] == [0.5, -0.5, 0.0]
 
 
 def test_the_guard_tells_the_servo_what_makes_the_angle_true():
-    class Car:
-        timeout_s = math.inf
-        told: list[float] = []  # noqa: RUF012
-
-        def write(self, steering_rad, throttle):
-            self.told.append(steering_rad)
-
-        def stop(self):
-            """Nothing moves."""
-
-        def close(self):
-            """Nothing to let go of."""
-
     car = Car()
     clock = iter(range(0, 10**12, 10**8))  # 0.1 s between two looks at it
-    guard = Guard(
-        car,
-        Limits(0.5, 1e3, 0.3),
-        timeout_s=1e3,
-        now_ns=lambda: next(clock),
-        corrections=Corrections.of(vehicle()),
-    )
+    limits, told = Limits(0.5, 1e3, 0.3), Corrections.of(vehicle())
+    guard = Guard(car, limits, 1e3, now_ns=lambda: next(clock), corrections=told)
     guard.arm()
     guard.write(0.3, 0.1)
     guard.close()
-    assert car.told == [pytest.approx((0.3 - 0.02) / 0.93)]
+    assert car.steered == [pytest.approx((0.3 - 0.02) / 0.93)]
 
 
 def test_a_pilot_whose_sensors_are_off_believes_the_same():

@@ -1,5 +1,8 @@
 """The expected places of markers against poses sampled one by one from the belief."""
 
+from types import SimpleNamespace
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -7,8 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from jaxnav.core.filter.bank import empty_bank
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
-from jaxnav.drive.expect import Expected, expect_corners
+from jaxnav.detection.observe import marker_keys
+from jaxnav.drive.expect import MARGIN_PX, Expectation, Expected, expect_corners
 from tests.worlds import observe, qcar_rig, room_markers
 
 RIG, MARKERS = qcar_rig(), room_markers()
@@ -127,3 +132,70 @@ def test_it_is_compiled_once():
         for belief in BELIEFS.values():
             expect(mean, covariance_of(*belief), 2.0)
     assert expect_corners.jitted._cache_size() - before <= 1
+
+
+NAVIGATOR = SimpleNamespace(rig=RIG, markers=MARKERS, corner_sigma_px=np.array(1.0))
+POSES = np.array([[0.1, 0.2, 1.5], [-0.4, -0.3, 0.2], [0.7, 0.1, -2.0], [0, 0, 0]])
+WEIGHTS = np.array([0.2, 0.5, 0.3, 0.0])  # of the last nothing is known
+TOLD_NS = 1_000_000_000
+
+
+def told(decided: bool, located: bool = True, now_ns: int = TOLD_NS, shift_m: float = 0.0):
+    """What the pilot gives: poses POSES, of which the second is the heaviest."""
+    bank = jax.device_get(empty_bank(jnp.zeros(6), 1e-4 * jnp.eye(6), 3, len(POSES)))
+    mean = bank.mean.copy()
+    mean[:, :3] = POSES + np.array([shift_m, 0, 0])
+    with np.errstate(divide="ignore"):
+        of_bank = mean, np.log(WEIGHTS), WEIGHTS > 0
+    bank = eqx.tree_at(lambda b: (b.mean, b.log_weight, b.initialised), bank, of_bank)
+    output = SimpleNamespace(
+        decided=decided,
+        located=located,
+        T_world_vehicle=jax.device_get(T_world_vehicle_from_planar(jnp.asarray(mean[1, :3]))),
+        pose_covariance=bank.covariance[1, :3, :3],
+    )
+    return output, bank, now_ns
+
+
+def seen_from(poses, covariance) -> list[tuple[tuple[str, int], np.ndarray]]:
+    """Key and corners of each marker that camera 0 may see from each pose."""
+    seen = []
+    for pose in poses:
+        expected = expect(pose, covariance, MARGIN_PX)
+        for m in np.flatnonzero(expected.visible[0]):
+            seen.append((marker_keys(MARKERS)[m], expected.quads_px[0, m]))
+    return seen
+
+
+def test_markers_are_expected_by_every_hypothesis_until_one_is_decided():
+    expectation = Expectation(NAVIGATOR)
+    assert expectation.region(0) is None
+    expectation.update(*told(decided=False, located=False))
+    assert expectation.region(0) is None
+    covariance = np.diag([1e-4] * 3) + np.diag([1e-4, 1e-4, np.deg2rad(0.5) ** 2])
+    expectation.update(*told(decided=False))
+    region = expectation.region(0)
+    assert not region.decided
+    assert region.flow_px_s is None
+    expected = seen_from(POSES[[1, 2, 0]], covariance)  # by weight
+    assert len(expected) > len(seen_from(POSES[[1]], covariance)) > 0
+    assert list(region.keys) == [key for key, _ in expected]
+    np.testing.assert_allclose(region.quads_px, [quad for _, quad in expected], atol=1e-6)
+    expectation.update(*told(decided=True))
+    region = expectation.region(0)
+    assert region.decided
+    expected = seen_from(POSES[[1]], covariance)
+    np.testing.assert_allclose(region.quads_px, [quad for _, quad in expected], atol=1e-6)
+
+
+def test_a_motion_is_that_between_two_decided_poses():
+    expectation, later_ns = Expectation(NAVIGATOR), TOLD_NS + 50_000_000
+    expectation.update(*told(decided=False, shift_m=-0.01))
+    expectation.update(*told(decided=True))
+    assert expectation.region(0).flow_px_s is None
+    before_px = expectation.region(0).quads_px
+    expectation.update(*told(decided=True, now_ns=later_ns, shift_m=0.01))
+    region = expectation.region(0)
+    moved_px = np.mean(region.quads_px - before_px, axis=1)
+    np.testing.assert_allclose(region.flow_px_s, moved_px / 0.05, rtol=1e-6)
+    assert np.max(np.abs(moved_px)) > 0.5

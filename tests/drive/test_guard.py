@@ -77,6 +77,24 @@ def drive(guard, duration_s, **beats):
         time.sleep(0.01)
 
 
+@pytest.fixture
+def driving(guard):
+    """One that is armed and has let commands through."""
+    guard.arm()
+    drive(guard, 0.05)
+    return guard
+
+
+@pytest.fixture
+def resuming(car):
+    guard = Guard(car, LIMITS, resumes=True)
+    guard.arm()
+    drive(guard, 0.05)
+    yield guard
+    car.let_go.set()
+    guard.close()
+
+
 def stopped_after(car, since):
     """Seconds until zero throttle, after which nothing else came."""
     zero = [index for index, (_, _, throttle) in enumerate(car.told) if throttle != 0][-1] + 1
@@ -112,16 +130,6 @@ def test_it_does_not_arm_again(car, guard):
     assert guard.reason == "told to"
 
 
-@pytest.fixture
-def resuming(car):
-    guard = Guard(car, LIMITS, resumes=True)
-    guard.arm()
-    drive(guard, 0.05)
-    yield guard
-    car.let_go.set()
-    guard.close()
-
-
 def test_where_the_file_allows_it_the_vehicle_drives_on_after_a_stop_for_being_late(car, resuming):
     for _ in range(2):
         since = len(car.told)
@@ -138,14 +146,12 @@ def test_where_the_file_allows_it_the_vehicle_drives_on_after_a_stop_for_being_l
         assert {throttle for _, _, throttle in car.told[since:]} == {0.2}
 
 
-def test_without_that_word_it_does_not_resume(car, guard):
-    guard.arm()
-    drive(guard, 0.05)
-    assert guard.wait(1.0)
-    assert guard.late
-    assert not guard.pauses
-    assert not guard.resume()
-    assert not guard.write(0.1, 0.2)
+def test_without_that_word_it_does_not_resume(car, driving):
+    assert driving.wait(1.0)
+    assert driving.late
+    assert not driving.pauses
+    assert not driving.resume()
+    assert not driving.write(0.1, 0.2)
 
 
 @pytest.mark.parametrize(
@@ -212,13 +218,11 @@ def test_the_clock_of_a_simulation_waits_for_who_is_behind(car):
 @pytest.mark.parametrize(
     "command", [(math.nan, 0.1), (0.1, math.nan), (math.inf, 0), (0, -math.inf)]
 )
-def test_a_command_that_is_no_number_stops_it(car, guard, command):
-    guard.arm()
-    drive(guard, 0.05)
-    assert not guard.write(*command)
-    assert guard.tripped
+def test_a_command_that_is_no_number_stops_it(car, driving, command):
+    assert not driving.write(*command)
+    assert driving.tripped
     assert car.told[-1][2] == 0
-    assert "no number" in guard.reason
+    assert "no number" in driving.reason
 
 
 def test_a_watched_thread_that_hangs_stops_it(car, guard):
@@ -240,28 +244,15 @@ def test_a_thread_that_ends_as_it_should_is_not_missed(car, guard):
     assert not guard.tripped
 
 
-def test_a_driver_that_hangs_is_stopped_around_it(car, guard):
-    guard.arm()
-    drive(guard, 0.05)
+def test_a_write_that_hangs_and_returns_after_the_stop_is_not_the_last_word(car, driving):
+    """It is stopped around. A driver that lets go in the end does what it was told long ago."""
     since = time.monotonic()
     car.hangs.set()
-    writer = threading.Thread(target=guard.write, args=(0.1, 0.2), daemon=True)
+    writer = threading.Thread(target=driving.write, args=(0.1, 0.2), daemon=True)
     writer.start()
-    assert guard.wait(1.0)
+    assert driving.wait(1.0)
     assert car.told[-1][2] == 0
     assert car.told[-1][0] - since < TIMEOUT_S + SLACK_S
-    car.let_go.set()
-    writer.join()
-
-
-def test_a_write_that_hangs_and_returns_after_the_stop_is_not_the_last_word(car, guard):
-    """A driver that lets go in the end does what it was told long ago."""
-    guard.arm()
-    drive(guard, 0.05)
-    car.hangs.set()
-    writer = threading.Thread(target=guard.write, args=(0.1, 0.2), daemon=True)
-    writer.start()
-    assert guard.wait(1.0)
     car.let_go.set()
     writer.join(1.0)
     throttles = [throttle for _, _, throttle in car.told]
@@ -270,12 +261,10 @@ def test_a_write_that_hangs_and_returns_after_the_stop_is_not_the_last_word(car,
     assert 0 in throttles[:hung]  # it was stopped around, and once more after it
 
 
-def test_an_outage_of_the_bus_is_outlasted(car, guard):
-    guard.arm()
-    drive(guard, 0.05)
+def test_an_outage_of_the_bus_is_outlasted(car, driving):
     car.fails = 10**9
-    guard.trip("told to")
-    assert "not now" in guard.unheard
+    driving.trip("told to")
+    assert "not now" in driving.unheard
     time.sleep(1.0)
     assert car.told[-1][2] != 0
     car.fails = 0
@@ -283,35 +272,29 @@ def test_an_outage_of_the_bus_is_outlasted(car, guard):
     while car.told[-1][2] != 0 and time.monotonic() < end_s:
         time.sleep(0.01)
     assert car.told[-1][2] == 0
-    assert guard.unheard is None
+    assert driving.unheard is None
 
 
-def test_a_vehicle_that_never_hears_is_told_of_when_it_is_closed(car, guard):
-    guard.arm()
-    drive(guard, 0.05)
+def test_a_vehicle_that_never_hears_is_told_of_when_it_is_closed(car, driving):
     car.fails = 10**9
-    guard.close(heard_within_s=0.1)
-    assert guard.unheard == "OSError: not now"
+    driving.close(heard_within_s=0.1)
+    assert driving.unheard == "OSError: not now"
 
 
-def test_a_dog_that_fails_stops_the_vehicle(car, guard, monkeypatch):
-    guard.arm()
-    drive(guard, 0.05)
-    monkeypatch.setattr(guard, "_beats", None)  # whatever it is that breaks it
-    assert guard.wait(1.0)
-    assert "the guard failed: AttributeError" in guard.reason
+def test_a_dog_that_fails_stops_the_vehicle(car, driving, monkeypatch):
+    monkeypatch.setattr(driving, "_beats", None)  # whatever it is that breaks it
+    assert driving.wait(1.0)
+    assert "the guard failed: AttributeError" in driving.reason
     assert car.told[-1][2] == 0
 
 
-def test_a_dog_that_is_gone_is_missed(car, guard, monkeypatch):
-    guard.arm()
-    drive(guard, 0.05)
+def test_a_dog_that_is_gone_is_missed(car, driving, monkeypatch):
     ended = threading.Thread(target=int)
     ended.start()
     ended.join()
-    monkeypatch.setattr(guard, "_thread", ended)
-    assert not guard.write(0.0, 0.2)
-    assert "the guard's own thread has ended" in guard.reason
+    monkeypatch.setattr(driving, "_thread", ended)
+    assert not driving.write(0.0, 0.2)
+    assert "the guard's own thread has ended" in driving.reason
 
 
 def test_a_command_after_its_own_deadline_is_not_obeyed(car, guard):

@@ -17,19 +17,12 @@ from jaxnav.drive.moved_vehicle import GuardProcess
 from jaxnav.errors import BadInput
 from tests.helpers import plain_car
 from tests.helpers.dying_parent import ENDS, LIMITS, make_setup
-from tests.helpers.plain_car import words
+from tests.helpers.plain_car import wait_for, words
 
 ROOT = Path(__file__).resolve().parents[2]
 STOPS_S = 0.2
 REPLACED_S = 2.0
 SLACK_S = 0.3  # of a machine that does something else; measured without it by bench_stop.py
-
-
-def wait_for(condition, within_s=10.0):
-    end_s = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < end_s, "it does not come"
-        time.sleep(0.01)
 
 
 @contextmanager

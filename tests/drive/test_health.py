@@ -8,14 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.drive.flags import Fault, Health, Reject, names
-from jaxnav.drive.health import (
-    LOOKS,
-    MOST_RESTARTS,
-    SPEED_FACTOR,
-    Monitor,
-    Senses,
-    Timeouts,
-)
+from jaxnav.drive.health import LOOKS, MOST_RESTARTS, SPEED_FACTOR, Monitor, Senses, Timeouts
 
 WELL = Senses(
     located=True,
@@ -34,58 +27,49 @@ def seen(**changes) -> tuple[Health, Fault]:
     return Monitor().look(dataclasses.replace(WELL, **changes))
 
 
+INF, F = math.inf, Fault
+LOST = {"located": False}
+BLIND = {"fix_age_s": 1.01}
+EXPLORES = {"decided": False}
+UNCONFIRMED = {"confirmed": False}
+
+
 @pytest.mark.parametrize(
     ("changes", "health", "faults"),
     [
-        ({}, Health.OK, Fault(0)),
-        ({"located": False}, Health.INIT, Fault(0)),
-        ({"decided": False}, Health.ALIGNED, Fault(0)),
-        ({"cameras_age_s": (0.03, 0.21)}, Health.OK, Fault.CAMERA_STALE),
-        (
-            {"cameras_age_s": (math.inf, 0.21)},
-            Health.DEGRADED,
-            Fault.CAMERA_STALE | Fault.CAMERAS_STALE,
-        ),
-        ({"fix_age_s": 1.01}, Health.DEAD_RECKONING, Fault.NO_MARKER),
-        ({"fix_age_s": 2.01}, Health.DEGRADED, Fault.NO_MARKER),
-        ({"fix_age_s": 5.01}, Health.STOP, Fault.NO_MARKER),
-        ({"odometry_age_s": 0.11}, Health.DEGRADED, Fault.ODOMETRY_STALE),
-        (
-            {"odometry_age_s": 1.01, "fix_age_s": 1.01},
-            Health.STOP,
-            Fault.ODOMETRY_STALE | Fault.NO_MARKER,
-        ),
-        ({"position_sigma_m": 0.51}, Health.STOP, Fault.UNSURE),
-        ({"position_sigma_m": math.nan}, Health.STOP, Fault.UNSURE),
-        ({"position_sigma_m": 0.51, "decided": False}, Health.ALIGNED, Fault(0)),
-        ({"distance_m": 3.01}, Health.STOP, Fault.FAR_FROM_FIX),
-        ({"faults": Fault.NOT_FINITE}, Health.STOP, Fault.NOT_FINITE),
-        ({"faults": Fault.VEHICLE_FAILED}, Health.STOP, Fault.VEHICLE_FAILED),
-        ({"faults": Fault.NOT_FINITE, "located": False}, Health.STOP, Fault.NOT_FINITE),
-        ({"faults": Fault.ODOMETRY_STUCK}, Health.DEGRADED, Fault.ODOMETRY_STUCK),
-        ({"faults": Fault.RECORDER_FAILED}, Health.OK, Fault.RECORDER_FAILED),
-        ({"faults": Fault.NOTHING_MOVES}, Health.STOP, Fault.NOTHING_MOVES),
-        ({"restarts": MOST_RESTARTS}, Health.OK, Fault(0)),
-        ({"restarts": MOST_RESTARTS + 1}, Health.STOP, Fault.RESTARTED_OFTEN),
-        (
-            {"restarts": MOST_RESTARTS + 1, "located": False},
-            Health.STOP,
-            Fault.RESTARTED_OFTEN,
-        ),
-        ({"cameras_age_s": ()}, Health.OK, Fault(0)),
-        ({"confirmed": False}, Health.INIT, Fault(0)),
-        ({"confirmed": False, "decided": False}, Health.ALIGNED, Fault(0)),
-        ({"refused": True}, Health.STOP, Fault(0)),
-        ({"refused": True, "confirmed": False}, Health.STOP, Fault(0)),
-        ({"faults": Fault.RELOCATED}, Health.DEGRADED, Fault.RELOCATED),
-        ({"faults": Fault.WAYS_DISPUTED}, Health.DEGRADED, Fault.WAYS_DISPUTED),
-        ({"faults": Fault.MARKER_OUTVOTED}, Health.OK, Fault.MARKER_OUTVOTED),
-        ({"faults": Fault.ODOMETRY_DOUBTFUL}, Health.DEGRADED, Fault.ODOMETRY_DOUBTFUL),
-        (
-            {"faults": Fault.ODOMETRY_DOUBTFUL, "fix_age_s": 1.01},
-            Health.STOP,
-            Fault.ODOMETRY_DOUBTFUL | Fault.NO_MARKER,
-        ),
+        ({}, Health.OK, F(0)),
+        (LOST, Health.INIT, F(0)),
+        (EXPLORES, Health.ALIGNED, F(0)),
+        (UNCONFIRMED, Health.INIT, F(0)),
+        (UNCONFIRMED | EXPLORES, Health.ALIGNED, F(0)),
+        ({"refused": True}, Health.STOP, F(0)),
+        ({"refused": True} | UNCONFIRMED, Health.STOP, F(0)),
+        ({"cameras_age_s": ()}, Health.OK, F(0)),
+        ({"cameras_age_s": (0.03, 0.21)}, Health.OK, F.CAMERA_STALE),
+        ({"cameras_age_s": (INF, 0.21)}, Health.DEGRADED, F.CAMERA_STALE | F.CAMERAS_STALE),
+        ({"fix_age_s": 1.01}, Health.DEAD_RECKONING, F.NO_MARKER),
+        ({"fix_age_s": 2.01}, Health.DEGRADED, F.NO_MARKER),
+        ({"fix_age_s": 5.01}, Health.STOP, F.NO_MARKER),
+        ({"odometry_age_s": 0.11}, Health.DEGRADED, F.ODOMETRY_STALE),
+        (BLIND | {"odometry_age_s": 1.01}, Health.STOP, F.ODOMETRY_STALE | F.NO_MARKER),
+        ({"position_sigma_m": 0.51}, Health.STOP, F.UNSURE),
+        ({"position_sigma_m": math.nan}, Health.STOP, F.UNSURE),
+        ({"position_sigma_m": 0.51} | EXPLORES, Health.ALIGNED, F(0)),
+        ({"distance_m": 3.01}, Health.STOP, F.FAR_FROM_FIX),
+        ({"restarts": MOST_RESTARTS}, Health.OK, F(0)),
+        ({"restarts": MOST_RESTARTS + 1}, Health.STOP, F.RESTARTED_OFTEN),
+        ({"restarts": MOST_RESTARTS + 1} | LOST, Health.STOP, F.RESTARTED_OFTEN),
+        ({"faults": F.NOT_FINITE}, Health.STOP, F.NOT_FINITE),
+        ({"faults": F.NOT_FINITE} | LOST, Health.STOP, F.NOT_FINITE),
+        ({"faults": F.VEHICLE_FAILED}, Health.STOP, F.VEHICLE_FAILED),
+        ({"faults": F.ODOMETRY_STUCK}, Health.DEGRADED, F.ODOMETRY_STUCK),
+        ({"faults": F.RECORDER_FAILED}, Health.OK, F.RECORDER_FAILED),
+        ({"faults": F.NOTHING_MOVES}, Health.STOP, F.NOTHING_MOVES),
+        ({"faults": F.RELOCATED}, Health.DEGRADED, F.RELOCATED),
+        ({"faults": F.WAYS_DISPUTED}, Health.DEGRADED, F.WAYS_DISPUTED),
+        ({"faults": F.MARKER_OUTVOTED}, Health.OK, F.MARKER_OUTVOTED),
+        ({"faults": F.ODOMETRY_DOUBTFUL}, Health.DEGRADED, F.ODOMETRY_DOUBTFUL),
+        (BLIND | {"faults": F.ODOMETRY_DOUBTFUL}, Health.STOP, F.ODOMETRY_DOUBTFUL | F.NO_MARKER),
     ],
 )
 def test_what_is_missing_costs(changes, health, faults):

@@ -27,9 +27,9 @@ class Drive:
         """Whether a reading is believed; its steering is never the same."""
         self.count += 1
         stamp_ns = BEGIN_NS + self.count * PERIOD_NS
-        steering_rad = 1e-6 * self.count if steering_rad is None else steering_rad
+        values = speed_mps, 1e-6 * self.count if steering_rad is None else steering_rad
         wanted_mps = throttle * PER_THROTTLE
-        return self.odometer.judge(speed_mps, steering_rad, stamp_ns, believed, seeing, wanted_mps)
+        return self.odometer.judge(speed_mps, values, stamp_ns, believed, seeing, wanted_mps)
 
     def accelerate(self, throttle: float, count: int) -> tuple[float, list[bool]]:
         """As the car does: a lag of first order."""
@@ -45,7 +45,7 @@ def test_what_the_throttle_can_do_is_believed(throttle):
     drive = Drive()
     speed, taken = drive.accelerate(throttle, 100)
     assert all(taken)
-    assert drive.odometer.last == (speed, pytest.approx(1e-4))
+    assert drive.odometer.last_mps == speed
     for _ in range(60):  # and it brakes
         speed *= math.exp(-0.02 / LAG_S)
         assert drive.tell(speed)[0]
@@ -84,7 +84,9 @@ def test_a_speed_that_the_motor_was_told_to_change_and_that_stays_is_stuck():
 
 def test_a_sensor_that_stands_while_corners_move_is_stuck():
     odometer = Odometer(MAX_MPS, LAG_S)
-    told = [odometer.judge(0.0, 0.0, BEGIN_NS + n, None, True, 0.0, n == 1) for n in (0, 1, 2)]
+    told = [
+        odometer.judge(0.0, (0.0, 0.0), BEGIN_NS + n, None, True, 0.0, n == 1) for n in (0, 1, 2)
+    ]
     assert told == [(True, Fault(0)), (False, Fault.ODOMETRY_STUCK), (True, Fault(0))]
 
 
@@ -138,11 +140,11 @@ def test_whatever_is_told_no_impossible_speed_is_believed(readings):
     for speed_mps, steering_rad, off_ns, believed, seeing, throttle in readings:
         stamp_ns = BEGIN_NS + off_ns
         told = stamp_ns, believed, seeing, throttle * PER_THROTTLE
-        taken, fault = odometer.judge(speed_mps, steering_rad, *told)
+        taken, fault = odometer.judge(speed_mps, (speed_mps, steering_rad), *told)
         assert fault in (Fault(0), Fault.ODOMETRY_STUCK)
         if taken:
             assert abs(speed_mps) <= 1.5 * MAX_MPS + 0.05
-            assert odometer.last == (speed_mps, steering_rad)
+            assert odometer.last_mps == speed_mps
 
 
 def test_the_limits_are_the_vehicles():

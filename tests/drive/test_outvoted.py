@@ -1,5 +1,5 @@
-"""A marker that others have outvoted does not count while it is alone in view, nor does an id that
-two cameras see at two places."""
+"""What is left out: a marker that others have outvoted while it is alone in view, an id that two
+cameras see at two places, and a camera that was knocked."""
 
 import dataclasses
 
@@ -10,18 +10,18 @@ import pytest
 from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.drive.chassis import Motion
-from jaxnav.drive.history import EventData
-from jaxnav.drive.outvoted import MarkerVotes, Twins
+from jaxnav.drive.history import Sighting
+from jaxnav.drive.outvoted import CameraVotes, MarkerVotes, Twins
 from jaxnav.drive.standstill import Way
 from tests import worlds
 
 IDS = (7, 3, 12)
 
 
-def told(*in_view: int, count: int = len(IDS)) -> EventData:
+def told(*in_view: int, count: int = len(IDS)) -> Sighting:
     visible = np.zeros((2, count), bool)
     visible[0, list(in_view)] = True
-    return EventData(
+    return Sighting(
         corners_px=np.zeros((2, count, 4, 2)), visible=visible, sigma_px=np.ones((2, count, 4))
     )
 
@@ -64,21 +64,14 @@ def test_one_that_agrees_again_is_believed_again():
     assert votes.remove_outvoted(alone) is alone
 
 
-@pytest.mark.parametrize("ids", [(0,), (0, 1)])
-def test_maps_too_small_to_vote_hide_nothing(ids):
-    votes = MarkerVotes(ids)
-    seen = told(*range(len(ids)), count=len(ids))
+@pytest.mark.parametrize(("ids", "in_view"), [((0,), 1), ((0, 1), 2), (IDS, 2)])
+def test_frames_that_show_too_few_do_not_count(ids, in_view):
+    """Also of a map that has no more."""
+    votes, count = MarkerVotes(ids), len(ids)
     for _ in range(50):
-        votes.count(seen, np.ones(len(ids), bool))
+        votes.count(told(*range(in_view), count=count), np.arange(count) < in_view)
     assert votes.outvoted == ()
-    assert votes.remove_outvoted(seen) is seen
-
-
-def test_frames_that_show_too_few_do_not_count():
-    votes, alone = MarkerVotes(IDS), told(0)
-    for _ in range(50):
-        votes.count(told(0, 1), voted(0))
-    assert votes.outvoted == ()
+    alone = told(0, count=count)
     assert votes.remove_outvoted(alone) is alone
 
 
@@ -88,12 +81,16 @@ TURN_M = (2.0, -1.6, np.pi)  # brings a copy behind the vehicle at its start
 ELSEWHERE = worlds.planar(*TURN_M).inverse()  # whoever sees the copy there sees the marker here
 
 
-def twins(rig=RIG) -> Twins:
+def navigator(rig=RIG) -> Navigator:
     selector = make_selector("paper-cost")
-    return Twins(Navigator(rig=rig, markers=MARKERS, vehicle=worlds.qcar(), selector=selector))
+    return Navigator(rig=rig, markers=MARKERS, vehicle=worlds.qcar(), selector=selector)
 
 
-def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int = 0) -> EventData:
+def twins(rig=RIG) -> Twins:
+    return Twins(navigator(rig))
+
+
+def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int = 0) -> Sighting:
     """What the cameras see from (x_m, y_m, psi_rad), some of them of the copy alone."""
     rng, T = np.random.default_rng(seed), worlds.planar(*place)
     truth, copy = worlds.observe(RIG, MARKERS, T), worlds.observe(RIG, MARKERS, ELSEWHERE @ T)
@@ -102,7 +99,7 @@ def views(place, cameras=range(4), of_copy=(), noise_px: float = 0.0, seed: int 
     visible = visible & np.isin(np.arange(4), list(cameras))[:, None]
     corners_px = np.where(of_copy[:, :, None, None], copy.corners_px, truth.corners_px)
     corners_px = corners_px + noise_px * rng.standard_normal(corners_px.shape)
-    return EventData(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
+    return Sighting(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
 
 
 def standing(until_ns: int) -> Way:
@@ -164,7 +161,7 @@ def test_cameras_that_look_in_turn_are_compared_along_the_way():
     assert watch.remove_twins(second, 200 * MS, Way()) is second
 
 
-@pytest.mark.parametrize("noise_px", [0.3, 2.0])
+@pytest.mark.parametrize("noise_px", [pytest.param(0.3, marks=pytest.mark.long), 2.0])
 def test_what_calibration_and_noise_allow_is_one_place(noise_px):
     """Cameras off by 1 deg and 1 cm, and each of them by 8 deg, wherever two see the marker."""
     rng, seen = np.random.default_rng(0), 0
@@ -191,3 +188,102 @@ def test_what_a_sure_estimate_judges_is_left_to_it():
     assert watch.remove_twins(both, 20 * MS, way, judged=True) is both
     assert not watch.seen(20 * MS)
     assert watch.remove_twins(both, 20 * MS, way) is None
+
+
+FRAME_NS = 66_000_000
+FOCAL_PX = float(np.mean(RIG.cameras.focal_px))
+DUE_PX = np.full((4, 1, 4, 2), 200.0)
+
+
+@pytest.fixture
+def votes():
+    return CameraVotes(navigator())
+
+
+def off(off_deg: dict[int, float]) -> Sighting:
+    """What the cameras in view see, each of them off by an angle."""
+    visible = np.isin(np.arange(4), list(off_deg))[:, None]
+    angles = np.array([off_deg.get(camera, 0.0) for camera in range(4)])
+    shift_px = FOCAL_PX * np.tan(np.deg2rad(angles))
+    return Sighting(
+        corners_px=DUE_PX + shift_px[:, None, None, None] * np.array([1.0, 0.0]),
+        visible=visible,
+        sigma_px=np.ones((4, 1, 4)),
+    )
+
+
+def count(votes, frames, begin_ns=0):
+    for index, off_deg in enumerate(frames):
+        votes.count(off(off_deg), DUE_PX, begin_ns + index * FRAME_NS)
+
+
+@pytest.mark.parametrize("off_deg", [-90.1, -30.0, 8.0, 30.0])
+@pytest.mark.parametrize("together", [True, False])
+def test_one_that_was_knocked_loses_its_vote_before_the_filter_gives_up(votes, off_deg, together):
+    frames = [{0: 0.2, 1: off_deg}] * 5 if together else [{1: off_deg}, {0: 0.2}] * 5
+    count(votes, frames[:-1])
+    assert votes.outvoted == ()
+    count(votes, frames[-1:], len(frames) * FRAME_NS)
+    assert votes.outvoted == ("right",)
+    both = off({0: 0.0, 1: off_deg})
+    left = votes.remove_outvoted(both)
+    np.testing.assert_array_equal(left.visible.any(axis=1), [True, False, False, False])
+    assert both.visible.sum() == 2
+    assert votes.remove_outvoted(off({1: off_deg})) is None
+
+
+def test_what_the_filter_learns_is_not_accused(votes):
+    count(votes, [{0: 0.0, 1: 4.0}] * 100)
+    assert votes.outvoted == ()
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [{0: 25.0, 1: 40.0}],  # carried off: no camera sees what it should
+        [{1: 40.0}],  # the other sees nothing any more
+        [{0: 4.0, 1: 7.0}],  # the estimate itself is off
+    ],
+)
+def test_a_car_that_was_carried_off_blinds_no_camera(votes, frames):
+    count(votes, [{0: 0.1}] * 10)
+    count(votes, frames * 100, 10 * FRAME_NS)
+    assert votes.outvoted == ()
+
+
+def test_one_frame_from_before_accuses_once(votes):
+    count(votes, [{1: 40.0}, {1: 40.0}, {1: 40.0}, {0: 0.1}, *[{1: 40.0}] * 50])
+    assert votes.outvoted == ()
+    assert votes._votes.tolist() == [0, 1, 0, 0]
+
+
+def test_a_camera_that_others_left_long_ago_is_not_accused(votes):
+    for index in range(50):
+        votes.count(off({index % 2: 40.0 * (index % 2)}), DUE_PX, index * 600_000_000)
+    assert votes.outvoted == ()
+
+
+def test_one_that_sees_what_it_should_gets_its_vote_back(votes):
+    count(votes, [{0: 0.0, 1: 30.0}] * 1000)
+    assert votes.outvoted == ("right",)
+    count(votes, [{1: 30.0}] * 1000)  # alone it does not
+    assert votes.outvoted == ("right",)
+    count(votes, [{1: 1.0}] * 6, 1 << 50)
+    assert votes.outvoted == ()
+
+
+def test_corners_that_can_t_be_projected_are_off(votes):
+    due_px = DUE_PX.copy()
+    due_px[1] = np.nan
+    for index in range(5):
+        votes.count(off({0: 0.0, 1: 0.0}), due_px, index * FRAME_NS)
+    assert votes.outvoted == ("right",)
+
+
+def test_it_is_asked_after_contradictions_and_while_a_camera_has_no_vote(votes):
+    assert not votes.open(0)
+    votes.note_contradiction(FRAME_NS)
+    assert votes.open(2 * FRAME_NS)
+    assert not votes.open(100 * FRAME_NS)
+    count(votes, [{0: 0.0, 1: 30.0}] * 5)
+    assert votes.open(100 * FRAME_NS)

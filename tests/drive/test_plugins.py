@@ -11,14 +11,7 @@ import pytest
 
 from jaxnav.drive import plugins
 from jaxnav.drive.interfaces import Camera, Vehicle
-from jaxnav.drive.plugins import (
-    CAMERAS,
-    VEHICLES,
-    load_factory,
-    open_cameras,
-    open_vehicle,
-    try_cameras,
-)
+from jaxnav.drive.plugins import CAMERAS, VEHICLES, load_factory, open_cameras, open_vehicle
 from jaxnav.errors import BadInput
 from tests.helpers.setups import GoodCamera, GoodVehicle, good_cameras, setup_with
 
@@ -48,15 +41,10 @@ def module(monkeypatch):
     return module
 
 
-def test_a_vehicle_is_found_by_its_entry_point():
-    vehicle = open_vehicle("good", SETUP)
-    assert isinstance(vehicle, GoodVehicle)
-
-
-def test_a_vehicle_is_found_by_module_and_name(module):
+def test_a_vehicle_is_found_by_its_entry_point_or_by_module_and_name(module):
     module.cars = SimpleNamespace(fast=GoodVehicle)
-    assert isinstance(open_vehicle(f"{HERE}:GoodVehicle", SETUP), GoodVehicle)
-    assert isinstance(open_vehicle("somebodys:cars.fast", SETUP), GoodVehicle)
+    for name in ("good", f"{HERE}:GoodVehicle", "somebodys:cars.fast"):
+        assert isinstance(open_vehicle(name, SETUP), GoodVehicle)
 
 
 def test_cameras_are_found_and_told_of_the_vehicle(module):
@@ -147,15 +135,9 @@ def plugins_members(protocol):
 
 
 def test_the_protocols_are_looked_at_as_they_are_written():
-    nothing = object()
-    assert plugins.missing_members(nothing, Vehicle) == [
-        "timeout_s",
-        "read()",
-        "write()",
-        "stop()",
-        "close()",
-    ]
-    assert plugins.missing_members(nothing, Camera) == ["name", "read()", "close()"]
+    of_vehicle = ["timeout_s", "read()", "write()", "stop()", "close()"]
+    assert plugins.missing_members(object(), Vehicle) == of_vehicle
+    assert plugins.missing_members(object(), Camera) == ["name", "read()", "close()"]
     assert plugins.missing_members(GoodCamera("front", (1, 1)), Camera) == []
 
 
@@ -190,10 +172,10 @@ def test_cameras_that_need_no_vehicle_are_tried_and_closed(module):
     cameras = good_cameras(SETUP, None)
     told = []
     module.opens = lambda setup, vehicle: told.append(vehicle) or cameras
-    try_cameras("somebodys:opens", SETUP)
+    plugins.try_cameras("somebodys:opens", SETUP)
     assert told == []
     module.opens.needs_no_vehicle = True
-    try_cameras("somebodys:opens", SETUP)
+    plugins.try_cameras("somebodys:opens", SETUP)
     assert told == [None]
     assert all(camera.closed.is_set() for camera in cameras)
 

@@ -41,11 +41,15 @@ def test_a_terminal_that_comes_first_already_is_left_alone(group):
     assert group.read_text() == "/autogroup-42 nice -15\n"
 
 
-def test_without_groups_or_without_the_right_to_it_goes_on(group, monkeypatch):
+@pytest.fixture
+def refused(monkeypatch):
     def refuse(*_):
         raise PermissionError
 
     monkeypatch.setattr(os, "setpriority", refuse)
+
+
+def test_without_groups_or_without_the_right_to_it_goes_on(group, refused, monkeypatch):
     group.unlink()
     with priority.before_others():
         assert not group.exists()
@@ -65,10 +69,6 @@ def test_a_thread_comes_before_its_siblings_and_goes_back(monkeypatch):
     assert given == [-10, priority.FIRST_NICE, -10]
 
 
-def test_a_thread_that_may_not_come_first_goes_on(monkeypatch):
-    def refuse(*_):
-        raise PermissionError
-
-    monkeypatch.setattr(os, "setpriority", refuse)
+def test_a_thread_that_may_not_come_first_goes_on(refused):
     with priority.before_siblings():
         pass

@@ -15,8 +15,9 @@ from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import Tracker, make_detector
 from jaxnav.detection.families import printed
+from jaxnav.drive.expect import Region
 from jaxnav.drive.interfaces import Frame
-from jaxnav.drive.seeing import Eyes, Region, Search
+from jaxnav.drive.seeing import Eyes, Search
 from tests import worlds
 from tests.helpers import late
 from tests.helpers.other_pictures import other_pictures

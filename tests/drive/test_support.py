@@ -27,6 +27,14 @@ class Seeing:
             taken.append(self.support.add_corners(*told, lambda: possible))
         return taken
 
+    @classmethod
+    def restarted(cls, **how):
+        """After a restart of the filter, once the place was confirmed."""
+        seeing = cls(**how)
+        seeing.frames(10)
+        seeing.support.note_restart()
+        return seeing
+
     def drives(self, way_m: float) -> None:
         for _ in range(50):
             wanted_mps = self.chassis.wanted_mps((0.0, way_m / 10))
@@ -37,7 +45,7 @@ class Seeing:
 def test_no_single_frame_confirms():
     seeing = Seeing()
     assert seeing.frames(CONFIRMED) == [False] * (CONFIRMED - 1) + [True]
-    assert not seeing.support.doubt(contradicted=False).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is None
 
 
 def test_frames_that_contradict_each_other_never_confirm():
@@ -45,7 +53,7 @@ def test_frames_that_contradict_each_other_never_confirm():
     for _ in range(100):
         assert not any(seeing.frames(CONFIRMED - 1))
         seeing.frames(1, believed=False)
-        assert seeing.support.doubt(contradicted=False).is_doubted
+        assert seeing.support.doubt_m(contradicted=False) is not None
 
 
 def test_one_contradiction_takes_nothing_away_and_many_do():
@@ -53,15 +61,15 @@ def test_one_contradiction_takes_nothing_away_and_many_do():
     seeing.frames(10)
     seeing.frames(1, believed=False)
     assert seeing.frames(1) == [True]
-    assert not seeing.support.doubt(contradicted=False).is_doubted
-    assert seeing.support.doubt(contradicted=True).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is None
+    assert seeing.support.doubt_m(contradicted=True) is not None
 
 
 def test_what_the_filter_accepts_beyond_its_gate_is_a_fix_and_confirms_nothing():
     """A car that is being located is not stopped for want of a fix; nor does it start on that."""
     seeing = Seeing()
     assert not any(seeing.frames(20, agrees=False))
-    assert seeing.support.doubt(contradicted=False).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is not None
     seeing.frames(CONFIRMED)
     assert seeing.frames(20, agrees=False) == [True] * 20
     seeing.support.note_restart()
@@ -71,9 +79,7 @@ def test_what_the_filter_accepts_beyond_its_gate_is_a_fix_and_confirms_nothing()
 
 
 def test_a_relocation_is_slow_until_some_way_was_driven():
-    seeing = Seeing()
-    seeing.frames(10)
-    seeing.support.note_restart()
+    seeing = Seeing.restarted()
     assert seeing.frames(CONFIRMED, AWAY)[-1]
     assert (seeing.support.relocated, seeing.support.relocations) == (True, 1)
     assert not seeing.support.refused
@@ -84,17 +90,14 @@ def test_a_relocation_is_slow_until_some_way_was_driven():
 
 
 def test_a_restart_nearby_is_no_relocation():
-    seeing = Seeing()
-    seeing.frames(10)
-    seeing.support.note_restart()
+    seeing = Seeing.restarted()
     assert seeing.frames(CONFIRMED, Fix(0.05, 0.05, 0.1, 0.01, 0.01))[-1]
     assert not seeing.support.relocated
 
 
 def test_every_further_relocation_asks_for_twice_as_many_frames():
-    seeing = Seeing()
+    seeing, needed, at = Seeing(), [], [AWAY, HERE]
     seeing.frames(10)
-    needed, at = [], [AWAY, HERE]
     for lap in range(9):
         seeing.support.note_restart()
         needed.append(seeing.frames(200, at[lap % 2]).index(True) + 1)
@@ -105,13 +108,11 @@ def test_every_further_relocation_asks_for_twice_as_many_frames():
 
 
 def test_who_must_not_relocate_refuses_and_goes_on_where_it_was():
-    seeing = Seeing(relocate=False)
-    seeing.frames(10)
-    seeing.support.note_restart()
+    seeing = Seeing.restarted(relocate=False)
     assert not any(seeing.frames(30, AWAY))
     assert seeing.support.refused
     assert seeing.support.relocated
-    assert seeing.support.doubt(contradicted=False).is_doubted
+    assert seeing.support.doubt_m(contradicted=False) is not None
     assert seeing.frames(1, HERE) == [True]
     assert not seeing.support.refused
     assert not seeing.support.relocated
@@ -119,9 +120,7 @@ def test_who_must_not_relocate_refuses_and_goes_on_where_it_was():
 
 @pytest.mark.parametrize(("possible", "refused"), [([AWAY, HERE], False), ([AWAY, AWAY], True)])
 def test_while_several_poses_are_possible_one_within_reach_suffices(possible, refused):
-    seeing = Seeing(relocate=False)
-    seeing.frames(10)
-    seeing.support.note_restart()
+    seeing = Seeing.restarted(relocate=False)
     taken = seeing.frames(5, None, possible=possible)
     assert seeing.support.refused == refused
     assert taken[-1] != refused

@@ -9,7 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxnav.drive.chassis import Motion, car_motion
-from jaxnav.drive.ways import Fix, Ranges, Ways
+from jaxnav.drive.ways import Corridor, Fix, Ranges, Ways
+from jaxnav.errors import BadInput
+from jaxnav.files import Route, load_route
 
 MS = 1_000_000
 WHEELBASE_M = 0.256
@@ -233,3 +235,34 @@ def test_who_stands_or_is_carried_off_is_told_nothing():
     assert ranges.sigma == math.inf
     assert looks(ranges, begin_m=2.0, way_m=0.05) is None
     assert looks(ranges, begin_m=1.4, way_m=0.5) is None  # from one look to the next
+
+
+SQUARE = ((2.0, 0.0), (2.0, 2.0), (0.0, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("place_m", "is_left"),
+    [((1.0, 0.9), False), ((1.0, -0.9), False), ((1.0, -1.1), True), ((3.5, 1.0), True),
+     ((-1.1, 0.0), True), ((1.0, 1.0), False), ((-0.9, 2.0), False), ((2.8, 2.8), True)],
+)  # fmt: skip
+def test_all_within_a_distance_of_a_leg_is_inside(place_m, is_left):
+    corridor = Corridor(SQUARE, 1.0)
+    assert not corridor.is_left(np.zeros(2))  # where it begins
+    assert corridor.is_left(np.array(place_m)) == is_left
+
+
+def test_a_route_of_one_place_where_it_stands_is_a_circle():
+    corridor, places_m = Corridor([(0.0, 0.0)], 1.0), np.array([(0, 0), (0.9, 0), (0, 1.1)])
+    assert [corridor.is_left(place_m) for place_m in places_m] == [False, False, True]
+
+
+def test_by_default_it_is_one_and_a_half_legs_and_a_metre(tmp_path):
+    assert Route(SQUARE, 0.1, (0.0, 0.0, 0.0)).leaves_at_m == 4.0
+    assert Route(SQUARE, 0.1, (-2.0, 0.0, 0.0)).leaves_at_m == 7.0  # the leg from the start counts
+    path = tmp_path / "route.yaml"
+    told = "start: {x_m: 0, y_m: 0, psi_deg: 0}\nwaypoints_m: [[1, 0]]\nwaypoint_radius_m: 0.1\n"
+    path.write_text(told + "leave_m: 2.5\n")
+    assert load_route(path).relative_to((1e6, 0.0, 0.0)).leaves_at_m == 2.5
+    path.write_text(told + "leave_m: -1\n")
+    with pytest.raises(BadInput, match="leave_m"):
+        load_route(path)

@@ -113,3 +113,11 @@ def words(path: Path) -> list[Word]:
     whole_lines = path.read_text().rpartition("\n")[0].splitlines()
     parts = (line.split() for line in whole_lines)
     return [Word(int(s), float(angle), float(t), int(pid)) for s, angle, t, pid in parts]
+
+
+def wait_for(condition, within_s=10.0):
+    """Wait until something that another process does can be seen."""
+    end_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end_s, "it does not come"
+        time.sleep(0.01)

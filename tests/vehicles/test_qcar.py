@@ -163,7 +163,7 @@ def test_a_write_that_comes_late_is_undone(hardware, car, monkeypatch):
 def test_a_stop_while_a_command_is_made_is_not_lost(hardware, car, monkeypatch):
     """The lock is taken and nothing is sent yet: the stop comes and goes in between."""
     slow = Held(lambda *command: (0.0, 0.2))
-    monkeypatch.setattr(car, "_limits", SimpleNamespace(apply=slow))
+    monkeypatch.setattr(car, "_limits", SimpleNamespace(within=slow))
     driving = begun_thread(car.write, 0.1, 0.2)
     slow.begun.wait(5.0)
     car.stop()

@@ -12,12 +12,12 @@ from jaxnav.cli import main
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.detection import make_detector
 from jaxnav.drive.estimator import advance_packed
-from jaxnav.drive.expect import expect_corners
+from jaxnav.drive.expect import Region, expect_corners
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.frames import FrameDetections
 from jaxnav.drive.interfaces import Frame
 from jaxnav.drive.pilot import Pilot
-from jaxnav.drive.seeing import Region, Search
+from jaxnav.drive.seeing import Search
 from jaxnav.sim.bases import BASES, equipped
 from jaxnav.sim.rendering import Renderer
 from jaxnav.sim.scene import Scene

@@ -15,11 +15,12 @@ from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator
 from jaxnav.detection import make_detector, marker_cells
 from jaxnav.detection.types import Detections
+from jaxnav.drive.expect import Region
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.interfaces import Frame
 from jaxnav.drive.packing import PackedLayout
 from jaxnav.drive.pilot import FrameDetections, Input, Pilot
-from jaxnav.drive.seeing import Region, Search
+from jaxnav.drive.seeing import Search
 from jaxnav.sim.rendering import Renderer
 from jaxnav.sim.scene import Scene
 from jaxnav.sim.sensor import Sensor

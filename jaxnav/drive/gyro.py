@@ -1,12 +1,12 @@
-"""Keep what a gyro has told of the last moments, and say how fast the vehicle turned meanwhile.
-
-    faults = track.take(readings, now_ns)
-    track.mean_radps(begin_ns, end_ns)      # NaN: not known
+"""What a gyro has told of the last moments, and whether it contradicts wheels and corners.
 
 A filter goes from event to event, and an event that comes late makes two intervals of one: so it is
 told the mean rate of any interval, from rates at the gyro's own stamps, between which the rate is
 taken to change evenly. Where a reading is missing, saturated or no number nothing is told, and the
 filter goes on by wheels and corners.
+
+Where the gyro and the wheels differ, the corners decide who is wrong, and where no marker is seen
+the command does. What differs beyond the errors of all of them is summed and slowly forgotten.
 """
 
 import math
@@ -15,8 +15,12 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from jaxnav.core.models.imu import Gyro
+from jaxnav.drive.actuation import Apart, Reach
+from jaxnav.drive.chassis import Chassis, Motion
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.interfaces import GyroReading
+from jaxnav.drive.limits import Command
 from jaxnav.drive.stamps import Stamps
 from jaxnav.files.ranges import RANGES
 
@@ -29,6 +33,15 @@ STUCK_AFTER = 25  # readings to the last bit alike, other than zero: a sensor's 
 # White noise of as many, which a sensor of cars has fifty times less of, and the most that a single
 # bend counts for: a single odd reading makes three, and is not yet noise.
 _NOISE_RADPS, _MOST_BEND_RADPS = 0.3, 0.8
+
+# Six degrees, a tenth of a rad for each metre of wheels that are 3 % apart, and what a turn's own
+# gain may be off by (tracks slide).
+_MARGIN_RAD, _SLACK_RADPM, _SHARE = 0.1, 0.1, 0.15
+_CLEARLY = 2.0  # so much farther from the third than the wheels are
+_FORGETS_S = 2.0
+_SIGMAS = 3.0  # of the gyro's bias
+_APART_NS = 300_000_000  # after a longer gap nothing is compared
+_SEEN_NS = 300_000_000  # after a fix; then the command is the third
 
 
 class _Sample(NamedTuple):
@@ -131,3 +144,88 @@ class GyroTrack:
             return None
         turned_rad = before.turned_rad + (before.turn_radps + turn_radps) / 2 * gap_s
         return _Sample(stamp_ns, turn_radps, turned_rad, before.part)
+
+
+class TurnVotes:
+    """The gyro of one drive, and the votes on its turn.
+
+    Attributes:
+        track: its readings.
+        gyro_is_wrong: for the rest of the drive: it was contradicted.
+    """
+
+    def __init__(self, chassis: Chassis, gyro: Gyro):
+        self.gyro_is_wrong = False
+        self._chassis, self.track = chassis, GyroTrack(float(gyro.saturation_radps))
+        self._bias_radps = _SIGMAS * float(gyro.bias_sigma_radps)
+        self._part = chassis.parts[-1]
+        self._reach = Reach(self._part.lag_s, self._part.factor)
+        self._gyro_wheels, self._gyro_corners, self._wheels_corners = Apart(), Apart(), Apart()
+        self._gyro_command, self._wheels_command = Apart(), Apart()
+        self._reading: tuple[int, Motion] | None = None
+        self._fix: tuple[int, float] | None = None
+        self._wheels_rad = self._way_m = 0.0  # since the last fix
+
+    def mean_radps(self, begin_ns: int, end_ns: int) -> float:
+        """What the gyro tells of the interval between two times, rad/s; NaN: nothing, or wrong."""
+        return math.nan if self.gyro_is_wrong else self.track.mean_radps(begin_ns, end_ns)
+
+    def add_command(self, command: Command, gap_s: float) -> None:
+        """Take the command that was in force for a time."""
+        self._reach.go(self._chassis.targets(command)[-1], gap_s)
+
+    def add_reading(self, now_ns: int, motion: Motion) -> None:
+        """Hold the gyro against a reading of the odometer."""
+        last, self._reading = self._reading, (now_ns, motion)
+        if last is None or not 0 < now_ns - last[0] <= _APART_NS:
+            return
+        gap_s = (now_ns - last[0]) / 1e9
+        turned_rad, way_m = motion.turn_radps * gap_s, motion.forward_mps * gap_s
+        self._wheels_rad += turned_rad
+        self._way_m += abs(way_m)
+        gyro_rad = self.track.mean_radps(last[0], now_ns) * gap_s
+        if not math.isfinite(gyro_rad):
+            return
+        share_rad = _SHARE * max(abs(turned_rad), abs(gyro_rad))
+        kept = math.exp(-gap_s / _FORGETS_S)
+        slack_rad = _SLACK_RADPM * abs(way_m)
+        bias_rad = self._bias_radps * gap_s
+        per = way_m if self._part.by_way else gap_s
+        least, most = sorted((per * self._reach.least, per * self._reach.most))
+        for apart, rad, slack in (
+            (self._gyro_command, gyro_rad, slack_rad + bias_rad),
+            (self._wheels_command, turned_rad, slack_rad),
+        ):
+            apart.add(rad - most, rad - least, slack, kept)
+        off_rad = gyro_rad - turned_rad
+        self._gyro_wheels.add(off_rad, off_rad, share_rad + slack_rad + bias_rad, kept)
+        if self._gyro_wheels.most > _MARGIN_RAD and not self.gyro_is_wrong:
+            seen = self._fix is not None and now_ns - self._fix[0] < _SEEN_NS
+            gyro, wheels = (
+                (self._gyro_corners, self._wheels_corners)
+                if seen
+                else (self._gyro_command, self._wheels_command)
+            )
+            self.gyro_is_wrong = gyro.most > max(_MARGIN_RAD / 2, _CLEARLY * wheels.most)
+
+    def add_fix(self, now_ns: int, psi_rad: float) -> None:
+        """Hold the gyro and the wheels against a heading by the corners."""
+        last, self._fix = self._fix, (now_ns, psi_rad)
+        wheels_rad, self._wheels_rad = self._wheels_rad, 0.0
+        way_m, self._way_m = self._way_m, 0.0
+        if last is None or not 0 < now_ns - last[0] <= _APART_NS:
+            return
+        gap_s = (now_ns - last[0]) / 1e9
+        turned_rad = math.remainder(psi_rad - last[1], math.tau)
+        gyro_rad = self.track.mean_radps(last[0], now_ns) * gap_s
+        slack_rad = _SHARE * abs(turned_rad)
+        kept = math.exp(-gap_s / _FORGETS_S)
+        off_rad = wheels_rad - turned_rad
+        self._wheels_corners.add(off_rad, off_rad, slack_rad + _SLACK_RADPM * way_m, kept)
+        if math.isfinite(gyro_rad):
+            off_rad = gyro_rad - turned_rad
+            self._gyro_corners.add(off_rad, off_rad, slack_rad + self._bias_radps * gap_s, kept)
+
+    def forget(self) -> None:
+        """The next heading follows from no earlier one: the filter has begun anew."""
+        self._fix = None
