@@ -15,7 +15,6 @@ from jaxnav.core.filter.bank import (
     Bank,
     CameraErrors,
     Moments,
-    Offer,
     PoseBelief,
     empty_bank,
     forget_lost,
@@ -25,7 +24,7 @@ from jaxnav.core.filter.bank import (
 from jaxnav.core.filter.choose import MeasuredPose
 from jaxnav.core.filter.errors import EACH, common_turn, schmidt_update_along
 from jaxnav.core.filter.motion import Motion, Planar, camera_states, follow_pose
-from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich, where
+from jaxnav.core.linalg.small_matrices import matvec, product, sandwich, where
 from jaxnav.core.models.geometry import (
     cayley,
     inverse_cayley,
@@ -88,39 +87,27 @@ class FreeBody(Motion):
 
     def poses(self, bank: Bank) -> PoseBelief:
         """The pose part of the state: free in six directions, without nuisances."""
+        P, errors = bank.covariance, None
+        if self.camera_states:
+            at = P.shape[-1] - self.camera_states
+            errors = CameraErrors(bank.mean[:, at + 1 :], P[:, at:, at:], P[:, :6, at:])
         return PoseBelief(
             jaxlie.SE3(bank.mean[:, :7]),
-            bank.covariance[:, :6, :6],
+            P[:, :6, :6],
             bank.log_weight,
             bank.initialised,
             jnp.eye(6, dtype=bank.mean.dtype),
             jnp.zeros((6, 0), bank.mean.dtype),
             self.gate_nis,
-            self._camera_errors(bank),
+            errors,
         )
 
-    def _camera_errors(self, bank: Bank) -> CameraErrors | None:
-        if not self.camera_states:
-            return None
-        P = bank.covariance
-        behind = P.shape[-1] - self.camera_states
-        return CameraErrors(bank.mean[:, behind + 1 :], P[:, behind:, behind:], P[:, :6, behind:])
-
-    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+    def compared(
+        self, bank: Bank, measured: MeasuredPose
+    ) -> tuple[Float[Array, " 6"], Float[Array, "6 6"], Float[Array, "6 6"]]:
         """See `Motion`, in 6 dof."""
-        mean, P = bank.mean, bank.covariance
-        log_volume = log_det(cholesky(measured.covariance)) / 2
-        R = measured.covariance + kalman.as_covariance(self.vision_floor)
-        innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
-        correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, dtype=P.dtype), R)
-        return Offer(
-            kalman.whiten(innovation, S),
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood
-            + log_volume
-            + kalman.log_likelihood(innovation, S),
-            posterior=(self.moved(mean, correction), posterior),
-        )
+        away = jaxlie.SE3(bank.mean[:7]).inverse() @ measured.T_world_vehicle
+        return inverse_cayley(away), jnp.eye(6, dtype=bank.mean.dtype), measured.covariance
 
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """See `Motion`, in 6 dof."""

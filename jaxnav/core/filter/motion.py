@@ -38,6 +38,7 @@ from jaxnav.core.filter.errors import EACH, ridge
 from jaxnav.core.linalg.small_matrices import (
     cholesky,
     gram,
+    log_det,
     matvec,
     product,
     sandwich,
@@ -140,6 +141,8 @@ class Motion(eqx.Module):
     """Base class of the motion models: the abstract methods differ, the others are shared."""
 
     states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
+    # What a candidate's pose gets wrong beside its corners' noise: sigmas, or a covariance.
+    vision_floor: eqx.AbstractVar[Float[Array, " m"] | Float[Array, "m m"]]
     # A pose of a larger NIS contradicts a hypothesis; inf: no gate. Each model has its own.
     gate_nis: float = eqx.field(default=float("inf"), kw_only=True)
     camera_states: int = eqx.field(static=True, default=0, kw_only=True)  # see `for_rig`
@@ -176,23 +179,41 @@ class Motion(eqx.Module):
         """Poses, covariances and weights of the hypotheses, for a selector."""
 
     @abc.abstractmethod
-    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """Fuse one hypothesis with a candidate that its selector has chosen (Eqs. 10 and 11)."""
+    def compared(
+        self, bank: Bank, measured: MeasuredPose
+    ) -> tuple[Float[Array, " m"], Float[Array, "m h"], Float[Array, "m m"]]:
+        """A measured pose less the predicted one, its derivative by the first h states, and R."""
 
     @abc.abstractmethod
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """Take over a pose that the selector has corrected, and correct the rest."""
 
     def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """Correct one hypothesis by a pose, for the gate to take or leave."""
-        if measured.innovation is None:
-            return self.fused(bank, measured)
+        """Correct one hypothesis by a pose, for the gate to take or leave.
+
+        A candidate that the selector has chosen is fused (Eqs. 10 and 11), a pose that it has
+        corrected is adopted.
+        """
+        if measured.innovation is not None:
+            return Offer(
+                measured.innovation,
+                self.adopted(bank, measured),
+                self.gate_nis,
+                measured.log_likelihood,
+                1.0 if measured.inflation is None else measured.inflation,
+            )
+        innovation, H, R = self.compared(bank, measured)
+        R = R + kalman.as_covariance(self.vision_floor)
+        correction, posterior, S = kalman.update(bank.covariance, innovation, H, R)
+        # Directions that were not free have the variance 0.
+        fitted = measured.covariance
+        fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
+        log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
         return Offer(
-            measured.innovation,
-            self.adopted(bank, measured),
+            kalman.whiten(innovation, S),
+            (self.moved(bank.mean, correction), posterior),
             self.gate_nis,
-            measured.log_likelihood,
-            1.0 if measured.inflation is None else measured.inflation,
+            measured.log_likelihood + log_volume + kalman.log_likelihood(innovation, S),
         )
 
     @abc.abstractmethod

@@ -15,7 +15,6 @@ from jaxnav.core.filter.bank import (
     Bank,
     CameraErrors,
     Moments,
-    Offer,
     PoseBelief,
     empty_bank,
     forget_lost,
@@ -41,7 +40,7 @@ from jaxnav.core.filter.odometry import (
     turned,
     velocity_lead_after,
 )
-from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich
+from jaxnav.core.linalg.small_matrices import matvec, product, sandwich
 from jaxnav.core.models.geometry import (
     OFF_GROUND,
     ON_GROUND,
@@ -183,27 +182,14 @@ class BicycleKalman(Motion):
             errors,
         )
 
-    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+    def compared(
+        self, bank: Bank, measured: MeasuredPose
+    ) -> tuple[Float[Array, " 3"], Float[Array, "3 h"], Float[Array, "3 3"]]:
         """See `Motion`, in 3 dof."""
-        P = bank.covariance
-        pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
-        R = planar_covariance(measured.T_world_vehicle, measured.covariance)
-        # Height, roll and pitch were fitted as well, or were not free: then their variances are 0.
-        fitted = measured.covariance
-        fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
-        log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
-        R = R + kalman.as_covariance(self.vision_floor)
+        T = measured.T_world_vehicle
         seen, slope = seen_pose(bank.mean, bank.velocity_lead)
-        innovation = self.difference(pose, seen)
-        correction, posterior, S = kalman.update(P, innovation, slope, R)
-        return Offer(
-            kalman.whiten(innovation, S),
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood
-            + log_volume
-            + kalman.log_likelihood(innovation, S),
-            posterior=(self.moved(bank.mean, correction), posterior),
-        )
+        gap = self.difference(planar_from_T_world_vehicle(T), seen)
+        return gap, slope, planar_covariance(T, measured.covariance)
 
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """See `Motion`, in 3 dof."""

@@ -193,18 +193,6 @@ class ConsistentSnapshot(NamedTuple):
     outvoted: Bool[Array, " M"]
 
 
-class Inliers(NamedTuple):
-    """What the rejection determines of a `ConsistentSnapshot`: visibility, not the snapshot."""
-
-    visible: Bool[Array, " D"]
-    candidates: Candidates
-    outvoted: Bool[Array, " M"]
-
-    def apply_to(self, snapshot: Snapshot) -> ConsistentSnapshot:
-        """`ConsistentSnapshot` for the snapshot in which this was found."""
-        return ConsistentSnapshot(_among(snapshot, self.visible), self.candidates, self.outvoted)
-
-
 def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSnapshot:
     """Leave out sightings that are not squares, and a marker that the others outvote.
 
@@ -217,23 +205,25 @@ def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> Consist
         none: the result without a marker in view, where `find` is not called.
     """
 
-    def nothing() -> Inliers:
-        nobody = jnp.zeros(len(snapshot.markers.ids), bool)
-        return Inliers(jnp.zeros_like(snapshot.seen.visible), none, nobody)
+    nobody = jnp.zeros(len(snapshot.markers.ids), bool)
+    visible, candidates, outvoted = jax.lax.cond(
+        jnp.any(snapshot.seen.visible),
+        lambda: _consistent(snapshot, find),
+        lambda: (jnp.zeros_like(snapshot.seen.visible), none, nobody),
+    )
+    return ConsistentSnapshot(_among(snapshot, visible), candidates, outvoted)
 
-    any_seen = jnp.any(snapshot.seen.visible)
-    kept: Inliers = jax.lax.cond(any_seen, lambda: find_inliers(snapshot, find), nothing)
-    return kept.apply_to(snapshot)
 
-
-def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
-    """As `remove_outliers`, but calls `find` also where no marker is in view."""
+def _consistent(
+    snapshot: Snapshot, find: Find
+) -> tuple[Bool[Array, " D"], Candidates, Bool[Array, " M"]]:
+    """What `remove_outliers` finds where a marker is in view: visibility, not the snapshot."""
     own = both_poses(snapshot)
     snapshot = _among(snapshot, _can_be_markers(snapshot, own))
     seen, candidates = snapshot.seen, find(snapshot, own)
     nobody = jnp.zeros(len(snapshot.markers.ids), bool)
     if nobody.shape[0] < LEAST_MARKERS or seen.visible.shape[0] < LEAST_MARKERS:
-        return Inliers(seen.visible, candidates, nobody)
+        return seen.visible, candidates, nobody
     in_view = jnp.sum(_in_view(seen, nobody.shape[0]))
     all_of_them = _excess(candidates, seen)
 
@@ -262,7 +252,7 @@ def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
         lambda: (jnp.ones_like(seen.visible), candidates),
     )
     outvoted = _in_view(_among(snapshot, ~kept).seen, nobody.shape[0])
-    return Inliers(seen.visible & kept, candidates, outvoted)
+    return seen.visible & kept, candidates, outvoted
 
 
 def _can_be_markers(snapshot: Snapshot, own: jaxlie.SE3) -> Bool[Array, " D"]:
