@@ -72,18 +72,17 @@ class FreeBody(Motion):
         mean = mean.at[7 : 7 + rest.shape[0]].set(rest.astype(dtype))
         return empty_bank(mean, jnp.eye(count, dtype=dtype), 6, hypotheses)
 
-    def without_lost(
-        self,
-        before: Bank,
-        mean: Float[Array, "K n"],
-        covariance: Float[Array, "K d d"],
-        dt_s: Float[Array, ""],
-    ) -> Bank:
-        """Take over predicted moments, and drop hypotheses that are contradicted or nowhere."""
-        bank = eqx.tree_at(lambda b: (b.mean, b.covariance), before, (mean, covariance))
-        variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
-        lost = self.lost(before) | ~(variance_m2 < self.lost_sigma_m**2)
-        return forget_lost(bank, lost, dt_s)
+    def predict(self, bank: Bank, obs: Observation) -> Bank:
+        """The bank `obs.dt_s` later; see `evolve`.
+
+        A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
+        position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
+        """
+        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
+        later = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, moments)
+        variance_m2 = jnp.max(jnp.diagonal(later.covariance, axis1=1, axis2=2)[:, :3], axis=1)
+        lost = self.lost(bank) | ~(variance_m2 < self.lost_sigma_m**2)
+        return forget_lost(later, lost, jnp.asarray(obs.dt_s, bank.mean.dtype))
 
     def poses(self, bank: Bank) -> PoseBelief:
         """The pose part of the state: free in six directions, without nuisances."""
@@ -235,7 +234,7 @@ class ConstantVelocity(FreeBody):
     )
     odometry_errors: OdometryErrors | None = None  # None: white noise is all that it gets wrong
 
-    def predict(self, bank: Bank, obs: Observation) -> Bank:
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
         """T = T exp(u dt),  P = F P F' + Q.
 
         u is the twist of the state, F = [Ad(exp(-u dt)), dt I; 0, I] and Q that of a white
@@ -246,15 +245,7 @@ class ConstantVelocity(FreeBody):
         with the drift D in the interval, and the twist at its end off its mean by A dt / 3, A the
         density of the acceleration. Errors of the odometry turn and scale u, and F has their
         derivatives of pose and twist.
-
-        A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
-        position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
         """
-        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
-        return self.without_lost(bank, *moments, jnp.asarray(obs.dt_s, bank.mean.dtype))
-
-    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
-        """One hypothesis `obs.dt_s` later; see `predict`."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
         read, twist = self._twist_read(obs, dtype)

@@ -54,7 +54,7 @@ from jaxnav.core.models.geometry import (
     shift_and_turn,
     wrap_angle,
 )
-from jaxnav.core.pose.candidates import SAME_POSE_RAD
+from jaxnav.core.pose.candidates import SAME_POSE_RAD, excess_of_best
 from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.refine import Candidates
 
@@ -566,7 +566,6 @@ def _started(
 
 
 def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
-    """By how much the best candidate misfits (`excess_of`); 1 without a candidate."""
-    cost = candidates.least_cost
-    freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
-    return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
+    """By how much the best candidate misfits, at least 1; 1 without a candidate."""
+    excess = excess_of_best(candidates, snapshot.seen)
+    return jnp.maximum(jnp.where(jnp.isfinite(excess), excess, 0), 1)

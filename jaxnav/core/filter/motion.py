@@ -29,7 +29,6 @@ from jaxnav.core.filter.bank import (
     PoseBelief,
     apply_gate,
     branched,
-    contradicted,
     merge_hypotheses,
     restart_broken,
 )
@@ -48,6 +47,9 @@ from jaxnav.core.linalg.small_matrices import (
 from jaxnav.core.models.geometry import inverse_cayley, inverse_cayley_jacobian
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import Observation
+
+# A time is up where less than this is left: it adds up from intervals, and has their rounding.
+_NO_TIME_S = 1e-3
 
 
 def follow_pose(
@@ -172,7 +174,8 @@ class Motion(eqx.Module):
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
-        return contradicted(bank, self.max_rejections, self.max_rejected_s)
+        lasted = bank.rejections.duration_s >= self.max_rejected_s - _NO_TIME_S
+        return (bank.rejections.count >= self.max_rejections) | lasted
 
     @abc.abstractmethod
     def poses(self, bank: Bank) -> PoseBelief:

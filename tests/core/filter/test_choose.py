@@ -26,11 +26,11 @@ from jaxnav.core.filter.choose import (
 )
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
+from tests.helpers.filters import find, select
 from tests.reference import paper
 
 BANK = MultiHypothesis(hypotheses=8)
@@ -54,12 +54,6 @@ VIEWS = {
     "frontal": FRONTAL,
     "none": worlds.NO_VIEW,
 }
-select = jax.jit(lambda selector, *arguments: selector(*arguments))
-
-
-@jax.jit
-def find(snapshot: Snapshot) -> Candidates:
-    return find_candidates(snapshot)
 
 
 @functools.partial(jax.jit, static_argnames="count")
@@ -171,13 +165,10 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
 class TestEverySelector:
     """The contract of a selector."""
 
-    def test_is_one(self, selector):
-        assert isinstance(selector, Selector)
-        assert selector.hypotheses >= 1
-
     def test_says_what_a_selection_is(self, selector, precision):
         """In every view, before and after the start, in both precisions; a batch says what its
         members say, in one."""
+        assert isinstance(selector, Selector)
         snapshots = [seen_from(pose, sigma_px=0.3) for pose in VIEWS.values()]
         found = [find(snapshot) for snapshot in snapshots]
         batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *zip(found, snapshots, strict=True))
@@ -293,12 +284,6 @@ def test_a_wide_minimum_holds_more_probability(selector):
     assert selection.flip_probability == pytest.approx(mass[1] / mass.sum(), abs=1e-12)
 
 
-def test_the_oracle_has_no_doubt():
-    candidates = candidates_at([TRUTH, TRUTH], [3.0, 3.0])
-    selection = Oracle()(belief(worlds.planar(*TRUTH)), candidates, seen_from(TRUTH))
-    assert selection.flip_probability == 0
-
-
 @pytest.mark.parametrize(
     ("errors_px", "max_ratio", "taken"),
     [((1.0, 3.1), 1 / 3, True), ((1.0, 2.9), 1 / 3, False), ((0.9, 1.0), 0.8, False),
@@ -410,8 +395,8 @@ def test_orientation_given_believes_the_heading():
         np.testing.assert_allclose(selection.costs, [1.0, 5.0] + gaps**2, rtol=1e-9)
         assert int(selection.selected) == 1
         assert selection.flip_probability < 1e-6
-    for heading in (np.nan, np.inf):
-        snapshot = seen_from(TRUTH, heading_rad=jnp.asarray(heading), **sensed)
+    for heading in (jnp.asarray(np.nan), jnp.asarray(np.inf), None):
+        snapshot = seen_from(TRUTH, heading_rad=heading, **sensed)
         selection = select(OrientationGiven(), prior, candidates, snapshot)
         np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
         assert int(selection.selected) == 0
@@ -442,13 +427,6 @@ def test_orientation_given_believes_the_normals():
         assert int(selection.selected) == (0 if len(broken) == 2 else 1)
 
 
-def test_orientation_given_is_the_image_s_without_a_sensor():
-    snapshot = seen_from(TRUTH, heading_rad=None, normals_camera=None)
-    candidates = candidates_at(PAIR, [1.0, 5.0])
-    selection = select(OrientationGiven(), belief(worlds.planar(*TRUTH)), candidates, snapshot)
-    np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
-
-
 def test_the_oracle_picks_what_is_nearest_to_the_truth_in_angle():
     """Even far away, with the higher errors and against the prediction."""
     poses = [(TRUTH[0], TRUTH[1], TRUTH[2] + 0.4), (9.0, 9.0, TRUTH[2] - 0.3), (2.0, -1.0, 1.0)]
@@ -456,6 +434,7 @@ def test_the_oracle_picks_what_is_nearest_to_the_truth_in_angle():
     selection = Oracle()(belief(worlds.planar(*poses[2])), candidates, seen_from(TRUTH))
     np.testing.assert_allclose(selection.costs, [0.4, 0.3, TRUTH[2] - 1.0], atol=1e-9)
     assert int(selection.selected) == 1
+    assert selection.flip_probability == 0
 
 
 def test_the_oracle_says_what_it_lacks():
@@ -474,15 +453,10 @@ def test_paper_cost_is_equations_13_and_14():
     metres = np.array(object_space_m2(candidates, prior, snapshot))
     np.testing.assert_allclose(selection.costs, [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
     assert int(selection.selected) == 0
-
-
-def test_before_the_first_pose_e_is_e1():
-    candidates = candidates_at([TRUTH, (1.0, -1.5, 1.0)], [2.0, 1.0])
-    arguments = (candidates, seen_from(TRUTH))
-    unaware = select(PaperCost(), belief(worlds.planar(*TRUTH), initialised=False), *arguments)
-    np.testing.assert_array_equal(unaware.costs, [2.0, 1.0])
-    assert int(unaware.selected) == 1
-    assert int(select(PaperCost(), belief(worlds.planar(*TRUTH)), *arguments).selected) == 0
+    # Before the first pose e is e1.
+    first = select(PaperCost(), belief(prior, initialised=False), candidates, snapshot)
+    np.testing.assert_array_equal(first.costs, [4.0, 3.0])
+    assert int(first.selected) == 1
 
 
 @pytest.fixture(scope="module")

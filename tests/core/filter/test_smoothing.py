@@ -16,6 +16,7 @@ from jaxnav.core.filter.smooth import Trail, doubt, smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
+from tests.helpers.filters import level
 
 STEPS = 12
 DT_S = 0.1
@@ -196,13 +197,10 @@ def test_errors_are_as_large_as_their_covariance_says_and_smaller_than_the_filte
 
 def bank_of(motion, turns_rad, log_weight, initialised, parent):
     """Four hypotheses at the origin that look in different directions."""
-    bank = motion.init(4)
-    wxyz_xyz = [
-        jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(float(a))).wxyz_xyz for a in turns_rad
-    ]
+    bank, turns = motion.init(4), np.stack([level(psi_rad=turn) for turn in turns_rad])
     return dataclasses.replace(
         bank,
-        mean=bank.mean.at[:, :7].set(jnp.stack(wxyz_xyz)),
+        mean=bank.mean.at[:, :7].set(turns),
         covariance=bank.covariance * 1e-4,
         log_weight=jnp.asarray(log_weight, float),
         initialised=jnp.asarray(initialised),

@@ -150,16 +150,14 @@ def test_lens_is_finite_everywhere(name, precision):
         assert np.all(np.isfinite(values))
 
 
-@pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2)])
-def test_lens_takes_any_batch(name, batch):
-    count = int(np.prod(batch))
-    camera, flat = build(name), points_in_view(name, count, seed=3)
-    pixels = project(camera, jnp.asarray(flat.reshape(*batch, 3)))
-    assert pixels.shape == (*batch, 2)
-    np.testing.assert_allclose(pixels.reshape(count, 2), true_pixels(name, flat), atol=1e-9)
-    rays, again, in_front = jax.eval_shape(unproject, camera, pixels)
-    assert (rays.shape, again.shape, in_front.shape) == ((*batch, 3), (*batch, 2), batch)
+@pytest.mark.parametrize("name", ONE_A_KIND)
+def test_lens_takes_any_batch(name):
+    camera, flat = build(name), points_in_view(name, 6, seed=3)
+    pixels = project(camera, jnp.asarray(flat.reshape(3, 1, 2, 3)))
+    np.testing.assert_allclose(pixels.reshape(6, 2), true_pixels(name, flat), atol=1e-9)
+    for batch in ((), (1,), (3, 1, 2)):
+        rays, again, in_front = jax.eval_shape(unproject, camera, jnp.zeros((*batch, 2)))
+        assert (rays.shape, again.shape, in_front.shape) == ((*batch, 3), (*batch, 2), batch)
 
 
 def test_what_lies_behind_is_not_in_front():

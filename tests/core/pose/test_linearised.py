@@ -90,20 +90,20 @@ rows_of = jax.jit(lambda rig, seen, points: reprojection_rows(rig, seen)(points)
     "lenses",
     [[lens] for lens in LENSES] + [["radtan", "equidistant", "none"]],
 )
-@pytest.mark.parametrize("special", [SIDE, AXIS, BEHIND, PLANE])
-def test_residuals_and_slopes_are_those_of_the_projection(lenses, special):
+def test_residuals_and_slopes_are_those_of_the_projection(lenses):
     """Also on the optical axis, in the camera's plane, and behind it."""
     rng = np.random.default_rng(len(lenses))
     rig = rig_of(lenses)
     seen = sightings_of(rig, rng)
-    in_camera = rng.normal(0, 0.2, (len(lenses), 4, 3)) + SIDE
-    in_camera[:, 0] = special
-    points = in_vehicle(rig, jnp.asarray(in_camera))
-    points = points.reshape(-1, 3).T[..., None] * jnp.ones((1, 1, 2))  # two poses alike
-    residual, slope = rows_of(rig, seen, points)
-    np.testing.assert_allclose(residual, projected(rig, seen, points), atol=1e-8)
-    expected = projected_slopes(rig, seen, points)
-    np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=1e-5)
+    for special in (SIDE, AXIS, BEHIND, PLANE):
+        in_camera = rng.normal(0, 0.2, (len(lenses), 4, 3)) + SIDE
+        in_camera[:, 0] = special
+        points = in_vehicle(rig, jnp.asarray(in_camera))
+        points = points.reshape(-1, 3).T[..., None] * jnp.ones((1, 1, 2))  # two poses alike
+        residual, slope = rows_of(rig, seen, points)
+        np.testing.assert_allclose(residual, projected(rig, seen, points), atol=1e-8)
+        expected = projected_slopes(rig, seen, points)
+        np.testing.assert_allclose(slope, expected, rtol=1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize("lens", LENSES)
