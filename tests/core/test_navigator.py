@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.filter.choose import MeasuredPose, PaperCost, Selection
-from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator, Output, State
 from jaxnav.core.parameters import parameters_of, with_parameters
@@ -462,17 +462,3 @@ def test_what_cannot_be_built_is_told():
         Navigator(rig=rig, markers=markers, waypoints_m=[(1.0, 0.0)])
     with pytest.raises(ValueError, match=r"\(W, 2\)"):
         Navigator(rig=rig, markers=markers, vehicle=worlds.qcar(), waypoints_m=[(1.0, 0.0, 0.0)])
-
-
-def test_the_marker_is_where_the_corners_say():
-    """The first output of a noise-free frame projects the marker onto its corners."""
-    nav, obs = navigator(), at(drive(sigma_px=0.0), 0)
-    _, out = step(nav, nav.init(), obs)
-    assert CORNER_SIGNS.shape == (4, 3)
-    pixels = nav.rig.project(
-        worlds.planar(*np.asarray(out.pose)).inverse(), nav.markers.corners_world_m
-    )
-    visible = np.asarray(obs.visible)
-    np.testing.assert_allclose(
-        np.asarray(pixels)[visible], np.asarray(obs.corners_px)[visible], atol=1e-3
-    )

@@ -106,7 +106,8 @@ class FreeBody(Motion):
     ) -> tuple[Float[Array, " 6"], Float[Array, "6 6"], Float[Array, "6 6"]]:
         """See `Motion`, in 6 dof."""
         away = jaxlie.SE3(bank.mean[:7]).inverse() @ measured.T_world_vehicle
-        return inverse_cayley(away), jnp.eye(6, dtype=bank.mean.dtype), measured.covariance
+        R = measured.covariance + kalman.as_covariance(self.vision_floor)
+        return inverse_cayley(away), jnp.eye(6, dtype=bank.mean.dtype), R
 
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """See `Motion`, in 6 dof."""

@@ -143,8 +143,6 @@ class Motion(eqx.Module):
     """Base class of the motion models: the abstract methods differ, the others are shared."""
 
     states: ClassVar[int]  # error states of pose and velocity; those of sensors come behind
-    # What a candidate's pose gets wrong beside its corners' noise: sigmas, or a covariance.
-    vision_floor: eqx.AbstractVar[Float[Array, " m"] | Float[Array, "m m"]]
     # A pose of a larger NIS contradicts a hypothesis; inf: no gate. Each model has its own.
     gate_nis: float = eqx.field(default=float("inf"), kw_only=True)
     camera_states: int = eqx.field(static=True, default=0, kw_only=True)  # see `for_rig`
@@ -206,7 +204,6 @@ class Motion(eqx.Module):
                 1.0 if measured.inflation is None else measured.inflation,
             )
         innovation, H, R = self.compared(bank, measured)
-        R = R + kalman.as_covariance(self.vision_floor)
         correction, posterior, S = kalman.update(bank.covariance, innovation, H, R)
         # Directions that were not free have the variance 0.
         fitted = measured.covariance

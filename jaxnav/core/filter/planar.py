@@ -197,7 +197,8 @@ class BicycleKalman(Motion):
         T = measured.T_world_vehicle
         seen, slope = seen_pose(bank.mean, bank.velocity_lead)
         gap = self.difference(planar_from_T_world_vehicle(T), seen)
-        return gap, slope, planar_covariance(T, measured.covariance)
+        R = planar_covariance(T, measured.covariance) + kalman.as_covariance(self.vision_floor)
+        return gap, slope, R
 
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """See `Motion`, in 3 dof."""

@@ -328,26 +328,13 @@ class LaneLM(LanewiseSolver):
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
     def init(
-        self,
-        fn: Any,
-        y: Poses,
-        args: Marks,
-        options: dict[str, Any],
-        f_struct: PyTree,
-        aux_struct: PyTree,
-        tags: frozenset[object],
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _State:
         """The trace of an earlier search, with which this one continues."""
         return _State(options["trace"], options["steps"])
 
     def step(
-        self,
-        fn: Any,
-        y: Poses,
-        args: Marks,
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
+        self, fn: Any, y: Poses, args: Marks, options: Any, state: _State, tags: Any
     ) -> tuple[Poses, _State, PyTree]:
         """Try one damped step in every lane that is not done."""
         cost, damping, before, done = state.trace
@@ -376,13 +363,7 @@ class LaneLM(LanewiseSolver):
         return y, _State(trace, state.left - 1), None
 
     def terminate(
-        self,
-        fn: Any,
-        y: Poses,
-        args: Marks,
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
+        self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether all lanes are done, or no step is left."""
         over = jnp.all(state.trace.done) | (state.left <= 0)

@@ -70,11 +70,28 @@ def first(bank):
     return jax.tree.map(lambda leaf: leaf[0], bank)
 
 
-def fused(motion, bank, pose, covariance):
-    """One hypothesis after a planar pose (3,) that no gate looks at."""
-    seen = MeasuredPose(worlds.planar(*pose), covariance, jnp.zeros(()), jnp.asarray(True))
-    mean, P = motion.offer(first(bank), seen).posterior
-    return dataclasses.replace(bank, mean=mean[None], covariance=P[None])
+@jax.jit
+def driven(motion, bank, readings, poses, sigma):
+    """The last bank of one hypothesis, and its means, whose poses no gate looks at.
+
+    Args:
+        readings: (frames, reads, 3), speed, steering and time since the one before.
+        poses: (frames, 3), planar.
+        sigma: (3,) of the poses.
+    """
+    R = PLANAR @ jnp.diag(sigma**2) @ PLANAR.T
+
+    def read(bank, told):
+        speed_mps, steering_rad, dt_s = told
+        return motion.predict(bank, reading(speed_mps, steering_rad, dt_s=dt_s)), None
+
+    def frame(bank, told):
+        bank, _ = jax.lax.scan(read, bank, told[0])
+        seen = MeasuredPose(worlds.planar(*told[1]), R, jnp.zeros(()), jnp.asarray(True))
+        mean, P = motion.offer(first(bank), seen).posterior
+        return dataclasses.replace(bank, mean=mean[None], covariance=P[None]), mean
+
+    return jax.lax.scan(frame, bank, (readings, poses))
 
 
 def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
@@ -303,17 +320,11 @@ def test_the_pose_follows_where_wheels_spin(slip_sigma):
     motion = BicycleKalman(car, slip_sigma=slip_sigma)
     start = motion.init(1)
     bank = believing(motion, start.mean, start.covariance.at[:, :SIX, :SIX].multiply(0.01**2))
-    sigma_m = 0.01
-    R = PLANAR @ (sigma_m**2 * jnp.eye(3)) @ PLANAR.T
-
-    def frame(bank, time_s):
-        read = 0.3 * jnp.where(time_s < 4, 1, 1.25)
-        bank = motion.predict(bank, reading(read, dt_s=1 / 15))
-        bank = fused(motion, bank, (0.3 * time_s, 0.0, 0.0), R)
-        return bank, bank.mean[0]
-
-    times_s = jnp.arange(1, 91) / 15
-    mean = np.asarray(jax.jit(lambda: jax.lax.scan(frame, bank, times_s)[1])())
+    times_s = np.arange(1, 91) / 15
+    told = np.tile([0.3, 0, 1 / 15], (90, 1, 1))
+    told[times_s >= 4, :, 0] *= 1.25
+    poses = np.outer(0.3 * times_s, [1, 0, 0])
+    mean = np.asarray(driven(motion, bank, told, poses, np.full(3, 0.01))[1])
     slip, scale = mean[:, SLIP], mean[:, SLIP + 1]
     behind_m = abs(mean[-1, 0] - 0.3 * times_s[-1])
     assert max(abs(slip[times_s < 4]).max(), abs(scale[times_s < 4]).max()) < 0.015
@@ -372,7 +383,6 @@ def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
     cars, period, reads = 16, 1 / 15, odometry_hz // 15
     motion = BicycleKalman(off_car())
     sigma = np.array([0.004, 0.004, 0.004])
-    R = PLANAR @ jnp.diag(jnp.asarray(sigma**2)) @ PLANAR.T
     start = motion.init(1)
     P = start.covariance.at[:, :3, :3].multiply(0.03**2).at[:, 3:SIX, 3:SIX].multiply(0.01**2)
     start = believing(motion, start.mean.at[0, 3].set(0.35), P)
@@ -384,20 +394,12 @@ def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
         seen = pose[np.round(at_ms - 1e3 * delay_s).astype(int)] - [*pose[250, :2], 0]
         poses.append(seen + sigma * rng.normal(size=(frames, 3)))
         ends = at_ms[:, None] - 1e3 * period * np.arange(reads)[::-1] / reads
-        readings.append(steering[np.round(ends).astype(int)])
+        angles = steering[np.round(ends).astype(int)]
+        speed, dt_s = np.full(angles.shape, 0.35), np.full(angles.shape, period / reads)
+        readings.append(np.stack([speed, angles, dt_s], axis=-1))
 
-    def frame(bank, told):
-        pose, steering = told
-
-        def read(bank, angle):
-            return motion.predict(bank, reading(0.35, angle, dt_s=period / reads)), None
-
-        bank, _ = jax.lax.scan(read, bank, steering)
-        bank = fused(motion, bank, pose, R)
-        return bank, None
-
-    drive = jax.jit(jax.vmap(lambda told: jax.lax.scan(frame, start, told)[0]))
-    bank = drive((jnp.asarray(np.array(poses)), jnp.asarray(np.array(readings))))
+    drive = jax.vmap(driven, (None, None, 0, 0, None))
+    bank, _ = drive(motion, start, np.array(readings), np.array(poses), sigma)
     tau = np.asarray(bank.mean[:, 0, SENSORS_END - 1])
     sigma_s = np.sqrt(np.asarray(bank.covariance[:, 0, SENSORS_END - 1, SENSORS_END - 1]))
     assert np.all(sigma_s < 0.01)

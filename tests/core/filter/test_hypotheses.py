@@ -160,28 +160,29 @@ def correlations(covariance, freedom) -> np.ndarray:
     return P / (sigma[:, :, None] * sigma[:, None])
 
 
-@pytest.mark.parametrize("freedom", [PLANAR, EYE])
-@pytest.mark.parametrize("floor", [0.0, 1e-4])
-def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom, floor):
+@jit_to_run
+def covariances_of(here, prior, snapshot, floors):
+    fits = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
+    return fits.posterior.covariance
+
+
+@pytest.mark.parametrize("freedom", [PLANAR, EYE], ids=["car", "free"])
+def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom):
     """A drive's first frames: nothing known to a metre, corners known to a fiftieth of a pixel."""
     snapshot, prior = view(NEAR, 0.02), priors(NEAR, freedom, scale=20.0)
     here = jnp.tile(worlds.planar(*NEAR).wxyz_xyz, (8, 1))
-    floors = jnp.full(6, floor)
-
-    def covariance(here, prior, snapshot, floors):
-        found = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
-        return found.posterior.covariance
-
-    exact = correlations(jit_to_run(covariance)(here, prior, snapshot, floors), freedom)
     narrow = {np.float64: np.float32, np.int64: np.int32}
-    with jax.enable_x64(False):
-        rounded = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, narrow.get(leaf.dtype.type, leaf.dtype)),
-            jax.tree.map(np.asarray, (here, prior, snapshot, floors)),
-        )
-        found = correlations(jit_to_run(covariance)(*rounded), freedom)
-    np.testing.assert_allclose(found, exact, atol=0.01)
-    assert np.all(np.linalg.eigvalsh(found) > 0)
+    for floor in (0.0, 1e-4):
+        told = here, prior, snapshot, jnp.full(6, floor)
+        exact = correlations(covariances_of(*told), freedom)
+        with jax.enable_x64(False):
+            rounded = jax.tree.map(
+                lambda leaf: jnp.asarray(leaf, narrow.get(leaf.dtype.type, leaf.dtype)),
+                jax.tree.map(np.asarray, told),
+            )
+            found = correlations(covariances_of(*rounded), freedom)
+        np.testing.assert_allclose(found, exact, atol=0.01)
+        assert np.all(np.linalg.eigvalsh(found) > 0)
 
 
 @pytest.mark.parametrize("most", [1.0, 1.5, 1e9])
@@ -562,7 +563,7 @@ def test_a_short_drive_across_decides_for_the_truth(across):
     assert not np.any(jumped & sure[:, :-1])
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_wheels_that_slip_choose_no_branch(seed):
     """They turn a car a tenth less than they say, so that all branches are contradicted alike."""
     poses = arc((2.0, -1.0, np.deg2rad(125.0)), 0.5, -0.4)

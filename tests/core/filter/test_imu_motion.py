@@ -20,6 +20,7 @@ from jaxnav.core.models.imu import (
 )
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
+from tests.core.models.test_imu import gtsam_of, need_gtsam
 from tests.derivatives import in_float32
 from tests.helpers.filters import believing, predicted
 
@@ -119,24 +120,16 @@ def test_gtsam_s_combined_factor_has_the_same_mean_and_covariance_of_the_predict
     covariance of the other sign than its own residuals (see `test_preintegration`).
     """
     noise = dataclasses.replace(NOISE, gyroscope_random_walk=1e-6, accelerometer_random_walk=1e-6)
-    gtsam = pytest.importorskip("gtsam", reason="gtsam, the oracle, has no wheel here")
+    gtsam = need_gtsam()
     mean, _ = random_state(5)
     mean[19:] = [0, 0, -9.81]
     gyro = np.tile([0.4, -1.0, 0.7], (200, 1))
     accel = np.random.default_rng(1).normal([1.0, -2.0, 9.0], 1, (200, 3))
     dt_s = 0.001
     gyro_bias, accel_bias = mean[13:16], mean[16:19]
-    params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
-    params.setBiasAccCovariance(np.eye(3) * noise.accelerometer_random_walk**2)
-    params.setBiasOmegaCovariance(np.eye(3) * noise.gyroscope_random_walk**2)
-    params.setBiasAccOmegaInit(np.zeros((6, 6)))
-    params.setGyroscopeCovariance(np.eye(3) * noise.gyroscope_noise_density**2)
-    params.setAccelerometerCovariance(np.eye(3) * noise.accelerometer_noise_density**2)
-    params.setIntegrationCovariance(np.zeros((3, 3)))
-    bias = gtsam.imuBias.ConstantBias(accel_bias, gyro_bias)
-    theirs = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    for w, a in zip(gyro, accel, strict=True):
-        theirs.integrateMeasurement(a, w, dt_s)
+    biases = accel_bias, gyro_bias
+    theirs = gtsam_of(gtsam, gyro, accel, dt_s, noise, biases, combined=True)
+    bias = gtsam.imuBias.ConstantBias(*biases)
 
     T = np.asarray(jaxlie.SE3(jnp.asarray(mean[:7])).as_matrix())
     R, v_world = T[:3, :3], T[:3, :3] @ mean[7:10]

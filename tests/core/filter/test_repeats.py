@@ -86,10 +86,8 @@ def test_what_has_moved_counts_anew():
 def test_what_surprises_counts_anew():
     """By n / surprise^2: at four times the bound a repeated sighting is new but for a sixteenth."""
     _, repeats = weigh(nothing(), snapshot())
-    one, four = (
-        jax.jit(MODEL.weighed)(repeats, snapshot(), surprise).seen.sigma_px[0, 0]
-        for surprise in (1.0, 4.0)
-    )
+    weighed = jax.jit(MODEL.weighed)
+    one, four = (weighed(repeats, snapshot(), by).seen.sigma_px[0, 0] for by in (1.0, 4.0))
     n = 1 / 16
     growth = (1 - SHARE + (n + 1) * SHARE) * (1 - SHARE + n * SHARE) / (1 - SHARE)
     assert float(four) == pytest.approx(SIGMA_PX * np.sqrt(growth))
@@ -163,9 +161,10 @@ def test_a_pause_changes_nothing():
 
 def test_white_errors_are_told_by_a_share_of_nothing():
     repeats, white = nothing(), RepeatedErrors(0.0, 0.0)
+    weighed, after = jax.jit(white.weighed), jax.jit(white.after)
     for _ in range(5):
-        seen = jax.jit(white.weighed)(repeats, snapshot()).seen
-        repeats = jax.jit(white.after)(repeats, snapshot(), pose(), YES)
+        seen = weighed(repeats, snapshot()).seen
+        repeats = after(repeats, snapshot(), pose(), YES)
         np.testing.assert_allclose(seen.sigma_px, snapshot().seen.sigma_px, rtol=1e-12)
 
 

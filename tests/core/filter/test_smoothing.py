@@ -1,4 +1,4 @@
-"""Smoothing against a dense least squares, against its own covariance, and along a bank's slots."""
+"""Smoothing against a dense least squares, and along a bank's slots; drives in `test_free.py`."""
 
 import dataclasses
 
@@ -58,7 +58,6 @@ def filter_and_smooth(motion, first, measured):
 
 
 run = jax.jit(filter_and_smooth)
-run_many = jax.jit(jax.vmap(filter_and_smooth, in_axes=(None, 0, 0)))
 
 
 def test_small_motions_are_smoothed_as_by_one_least_squares_over_all_of_them():
@@ -153,46 +152,6 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
         block = covariance[6 * step : 6 * step + 6, 6 * step : 6 * step + 6]
         np.testing.assert_allclose(mean - nominal[step], expected[step], atol=1e-4 * small)
         np.testing.assert_allclose(found, block, atol=1e-5 * block.max())
-
-
-def simulated(motion, key):
-    """A first mean (13,), poses (STEPS, 7) and twists (STEPS, 6) of a body, measured poses."""
-    keys = jax.random.split(key, 3)
-    still = jnp.zeros(13).at[0].set(1)
-    first = motion.moved(still, jax.random.normal(keys[0], (12,)) * jnp.sqrt(jnp.diag(P_FIRST)))
-    Q = kalman.white_acceleration(motion.acceleration_density, DT_S)
-    root = jnp.linalg.cholesky(Q)
-
-    def go(mean, key):
-        later = motion.evolve(mean, P_FIRST, after(DT_S))[0]
-        later = motion.moved(later, root @ jax.random.normal(key, (12,)))
-        return later, later
-
-    _, rest = jax.lax.scan(go, first, jax.random.split(keys[1], STEPS - 1))
-    truth = jnp.concatenate([first[None], rest])
-    noise = SIGMA[None] * jax.random.normal(keys[2], (STEPS, 6))
-    poses = jax.vmap(lambda one, xi: (jaxlie.SE3(one[:7]) @ cayley(xi)).wxyz_xyz)(truth, noise)
-    return still, truth, poses
-
-
-def test_errors_are_as_large_as_their_covariance_says_and_smaller_than_the_filters():
-    motion, drives = ConstantVelocity(), 200
-    still, truth, poses = jax.jit(jax.vmap(lambda key: simulated(motion, key)))(
-        jax.random.split(jax.random.key(5), drives)
-    )
-    first = still, jnp.broadcast_to(P_FIRST, (drives, 12, 12))
-    errors, nees = [], []
-    for mean, P in run_many(motion, first, poses):
-        error = jax.vmap(jax.vmap(motion.difference))(truth, mean)
-        errors.append(np.asarray(error))
-        whitened = np.linalg.solve(np.linalg.cholesky(P), errors[-1][..., None])[..., 0]
-        nees.append(np.mean(np.sum(whitened**2, axis=-1), axis=0) / 12)
-    filtered, both = (np.sqrt(np.mean(error**2, axis=0)) for error in errors)
-    # 200 drives of 12 degrees of freedom: a sigma of 3 %.
-    assert np.all(np.abs(nees[1] - 1) < 0.12), nees[1]
-    np.testing.assert_allclose(both[-1], filtered[-1], rtol=1e-12)  # the last one knows as much
-    middle = slice(2, STEPS - 2)
-    assert np.all(both[middle].mean(axis=0) < 0.95 * filtered[middle].mean(axis=0))
 
 
 def bank_of(motion, turns_rad, log_weight, initialised, parent):

@@ -30,8 +30,13 @@ MODELS = {
     "double_sphere": ("double_sphere", [-0.2, 0.59], 255.0, (836, 420), 110),
     "eucm": ("eucm", [0.62, 1.1], 319.0, (836, 420), 100),
 }
-# Of which the tests of derivatives and of finiteness take one a kind.
-ONE_A_KIND = [name for name in MODELS if name not in ("radtan k3", "equidistant")]
+# Of which the tests of derivatives and of finiteness take one a kind: `omni` and `thin_prism` have
+# the terms of two of them.
+ONE_A_KIND = [
+    pytest.param(name, marks=[pytest.mark.long] if name in ("radtan", "rational") else [])
+    for name in MODELS
+    if name not in ("radtan k3", "equidistant")
+]
 
 
 def build(name: str) -> Camera:

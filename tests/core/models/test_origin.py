@@ -29,7 +29,7 @@ from jaxnav.core.models.origin import (
 )
 from jaxnav.drive.flags import Health
 from jaxnav.files import Route, calib_dir, load_markers, load_route, poses, save_markers, write_tum
-from jaxnav.files.markers import MarkerFile, marker_data, marker_map
+from jaxnav.files.markers import MarkerFile, marker_map
 from jaxnav.files.vehicles import RouteFile
 from jaxnav.pictures.rerun.scene import RerunScene
 from jaxnav.pictures.scenery import Scenery
@@ -311,10 +311,3 @@ def test_a_route_file_goes_with_its_map(tmp_path):
     np.testing.assert_allclose(moved.waypoints_m, near.waypoints_m + rest_m, atol=1e-6)
     np.testing.assert_allclose(moved.start_pose[:2], near.start_pose[:2] + rest_m, atol=1e-6)
     assert math.isclose(moved.start_pose[2], near.start_pose[2])
-
-
-def test_a_file_of_far_markers_has_their_places(tmp_path):
-    with jax.enable_x64(False):
-        markers = MarkerFile.model_validate(shifted_map(FAR_M)).map()
-        place = marker_data(markers)["markers"][0]["T_world_marker"]["xyz_m"]
-    np.testing.assert_allclose(place, np.array([0, 1.47, 0.226]) + FAR_M, atol=0.01 * MM)

@@ -94,6 +94,7 @@ def test_a_marker_seen_by_two_cameras_counts_once_in_e2_and_twice_in_e1():
     assert min(images) > 0
 
 
+@pytest.mark.parametrize("world", ["hand-held"], indirect=True)
 def test_derivatives_of_e1(world):
     rig, markers, obs, T_vehicle_world = world
 
@@ -109,6 +110,7 @@ def test_derivatives_of_e1(world):
     assert np.all(by_corner[np.asarray(obs.visible)] != 0)
 
 
+@pytest.mark.parametrize("world", ["hand-held"], indirect=True)
 def test_derivatives_of_e2(world):
     _, markers, obs, T_vehicle_world = world
 
