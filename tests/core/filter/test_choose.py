@@ -77,18 +77,20 @@ def belief(T_world_vehicle: jaxlie.SE3, initialised: bool = True, count: int = 1
 inverses = jax.jit(jax.vmap(lambda pose: worlds.T_world_vehicle_from_planar(pose).inverse()))
 
 
-def candidates_at(poses, e1_px2, valid=None, covariance=None) -> Candidates:
-    """Candidates as given, sigma 1 px."""
-    count = len(poses)
+def candidates_at(poses, e1_px2, valid=None, covariance=None, lanes=4) -> Candidates:
+    """Candidates as given, sigma 1 px, and as many more lanes as `find` has, none of them valid."""
+    count, rest = len(poses), lanes - len(poses)
     covariance = np.broadcast_to(np.eye(6), (count, 6, 6)) if covariance is None else covariance
+    covariance = np.concatenate([covariance, np.broadcast_to(np.eye(6), (rest, 6, 6))])
+    e1_px2 = jnp.asarray(np.append(e1_px2, np.zeros(rest)), float)
     return Candidates(
-        T_vehicle_world=inverses(jnp.asarray(poses, float)),
-        e1_px2=jnp.asarray(e1_px2, float),
-        cost=jnp.asarray(e1_px2, float),
+        T_vehicle_world=inverses(jnp.asarray([*poses, *[TRUTH] * rest], float)),
+        e1_px2=e1_px2,
+        cost=e1_px2,
         covariance=jnp.asarray(covariance, float),
-        valid=jnp.ones(count, bool) if valid is None else jnp.asarray(valid),
-        converged=jnp.ones(count, bool),
-        steps=jnp.ones(count, int),
+        valid=jnp.asarray([*([True] * count if valid is None else valid), *[False] * rest]),
+        converged=jnp.ones(lanes, bool),
+        steps=jnp.ones(lanes, int),
     )
 
 
@@ -295,7 +297,7 @@ def test_ratio_test_discards_what_is_not_clear(errors_px, max_ratio, taken):
         candidates = candidates_at([TRUTH, (1.0, -1.5, 1.0)], np.square(errors))
         prior = belief(worlds.planar(*TRUTH))
         selection = select(RatioTest(max_ratio), prior, candidates, seen_from(TRUTH))
-        np.testing.assert_allclose(selection.costs, np.square(errors))
+        np.testing.assert_allclose(selection.costs[:2], np.square(errors))
         assert bool(selection.measured.valid[0]) == taken
         assert int(selection.selected) == (int(np.argmin(errors)) if taken else -1)
         # Of a pose that is not given nothing is doubtful.
@@ -305,7 +307,7 @@ def test_ratio_test_discards_what_is_not_clear(errors_px, max_ratio, taken):
 def test_ratio_test_takes_an_only_candidate():
     prior, snapshot = belief(worlds.planar(*TRUTH)), seen_from(TRUTH)
     for candidates in (
-        candidates_at([TRUTH], [4.0]),
+        candidates_at([TRUTH], [4.0], lanes=1),
         candidates_at([TRUTH, TRUTH, TRUTH], [4.0, 4.1, 4.2], [True, False, False]),
     ):
         selection = select(RatioTest(), prior, candidates, snapshot)
@@ -321,7 +323,7 @@ def object_space_m2(candidates: Candidates, prior: jaxlie.SE3, snapshot: Snapsho
             T,
             np.asarray(prior.inverse().as_matrix()),
         )
-        for T in np.asarray(candidates.T_vehicle_world.as_matrix())
+        for T in np.asarray(candidates.T_vehicle_world.as_matrix())[np.asarray(candidates.valid)]
     ]
 
 
@@ -331,12 +333,12 @@ def test_object_space_is_equation_14_alone():
     candidates = candidates_at([(0.5, -0.2, 0.1), (0.2, 0.1, 0.6)], [0.1, 1e4])
     selection = select(ObjectSpace(), belief(prior), candidates, snapshot)
     expected = object_space_m2(candidates, prior, snapshot)
-    np.testing.assert_allclose(selection.costs, expected, rtol=1e-11)
+    np.testing.assert_allclose(selection.costs[:2], expected, rtol=1e-11)
     assert expected[1] < expected[0]
     assert int(selection.selected) == 1
     # Without a prediction there is only the image.
     first = select(ObjectSpace(), belief(prior, initialised=False), candidates, snapshot)
-    np.testing.assert_array_equal(first.costs, [0.1, 1e4])
+    np.testing.assert_array_equal(first.costs[:2], [0.1, 1e4])
     assert int(first.selected) == 0
 
 
@@ -348,7 +350,7 @@ def test_mahalanobis_is_the_whitened_error():
     covariances = roots @ np.swapaxes(roots, 1, 2)
     cost = np.array([8.0, 5.0, 2.0])
     candidates = candidates_at(poses, cost, covariance=covariances)
-    candidates = eqx.tree_at(lambda c: c.e1_px2, candidates, jnp.asarray([1.0, 2.0, 3.0]))
+    candidates = eqx.tree_at(lambda c: c.e1_px2, candidates, jnp.arange(1.0, 5.0))
     P = 0.2 * rng.normal(size=(6, 6))
     P = P @ P.T
     prior = eqx.tree_at(lambda b: b.covariance, belief(worlds.planar(*TRUTH)), jnp.asarray(P[None]))
@@ -369,7 +371,7 @@ def test_mahalanobis_is_the_whitened_error():
         )
     expected = np.array(expected)
     selection = select(Mahalanobis(), prior, candidates, seen_from(TRUTH))
-    np.testing.assert_allclose(selection.costs, expected, rtol=1e-9)
+    np.testing.assert_allclose(selection.costs[:3], expected, rtol=1e-9)
     best = int(np.argmin(expected))
     assert int(selection.selected) == best
     mass = np.exp(-(expected - expected[best]) / 2)
@@ -377,7 +379,7 @@ def test_mahalanobis_is_the_whitened_error():
     # Before the first pose: the image, and the width of its minima.
     prior = eqx.tree_at(lambda b: b.initialised, prior, jnp.asarray([False]))
     first = select(Mahalanobis(), prior, candidates, seen_from(TRUTH))
-    np.testing.assert_allclose(first.costs, cost - np.linalg.slogdet(covariances)[1], rtol=1e-9)
+    np.testing.assert_allclose(first.costs[:3], cost - np.linalg.slogdet(covariances)[1], rtol=1e-9)
 
 
 PAIR = [(1.2, -1.4, 1.0), TRUTH]  # e1 speaks for the first, the other sensors for the second
@@ -392,13 +394,13 @@ def test_orientation_given_believes_the_heading():
         snapshot = seen_from(TRUTH, heading_rad=jnp.asarray(heading), **sensed)
         selection = select(OrientationGiven(), prior, candidates, snapshot)
         gaps = np.array([TRUTH[2] + 0.05 - 1.0, 0.05]) / 0.1
-        np.testing.assert_allclose(selection.costs, [1.0, 5.0] + gaps**2, rtol=1e-9)
+        np.testing.assert_allclose(selection.costs[:2], [1.0, 5.0] + gaps**2, rtol=1e-9)
         assert int(selection.selected) == 1
         assert selection.flip_probability < 1e-6
     for heading in (jnp.asarray(np.nan), jnp.asarray(np.inf), None):
         snapshot = seen_from(TRUTH, heading_rad=heading, **sensed)
         selection = select(OrientationGiven(), prior, candidates, snapshot)
-        np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
+        np.testing.assert_array_equal(selection.costs[:2], [1.0, 5.0])
         assert int(selection.selected) == 0
 
 
@@ -423,7 +425,7 @@ def test_orientation_given_believes_the_normals():
             for camera in {first, second} - set(broken):
                 cosine = believed[camera, 0] @ np.asarray(tilted)[camera, 0]
                 expected[index] += (np.arccos(cosine) / 0.05) ** 2
-        np.testing.assert_allclose(selection.costs, expected, rtol=1e-6)
+        np.testing.assert_allclose(selection.costs[:2], expected, rtol=1e-6)
         assert int(selection.selected) == (0 if len(broken) == 2 else 1)
 
 
@@ -432,7 +434,7 @@ def test_the_oracle_picks_what_is_nearest_to_the_truth_in_angle():
     poses = [(TRUTH[0], TRUTH[1], TRUTH[2] + 0.4), (9.0, 9.0, TRUTH[2] - 0.3), (2.0, -1.0, 1.0)]
     candidates = candidates_at(poses, [1.0, 50.0, 0.0])
     selection = Oracle()(belief(worlds.planar(*poses[2])), candidates, seen_from(TRUTH))
-    np.testing.assert_allclose(selection.costs, [0.4, 0.3, TRUTH[2] - 1.0], atol=1e-9)
+    np.testing.assert_allclose(selection.costs[:3], [0.4, 0.3, TRUTH[2] - 1.0], atol=1e-9)
     assert int(selection.selected) == 1
     assert selection.flip_probability == 0
 
@@ -451,11 +453,11 @@ def test_paper_cost_is_equations_13_and_14():
     candidates = candidates_at([(0.2, 0.1, 0.6), (0.5, -0.2, 0.1)], [4.0, 3.0])
     selection = select(PaperCost(), belief(prior), candidates, snapshot)
     metres = np.array(object_space_m2(candidates, prior, snapshot))
-    np.testing.assert_allclose(selection.costs, [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
+    np.testing.assert_allclose(selection.costs[:2], [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
     assert int(selection.selected) == 0
     # Before the first pose e is e1.
     first = select(PaperCost(), belief(prior, initialised=False), candidates, snapshot)
-    np.testing.assert_array_equal(first.costs, [4.0, 3.0])
+    np.testing.assert_array_equal(first.costs[:2], [4.0, 3.0])
     assert int(first.selected) == 1
 
 
