@@ -30,7 +30,6 @@ from jaxnav.core.filter.odometry import (
     ReadVelocity,
     Turn,
     bias_at_rest,
-    from_seen,
     gyro_variance,
     read_velocity,
     seen_pose,
@@ -376,8 +375,9 @@ def planar_poses(
 
 def _at_stamp(seen: Array, P: Array, velocity_lead: Array) -> Moments:
     """A state at its stamp, of one whose first three entries are the seen pose."""
-    mean, slope = from_seen(seen, velocity_lead)
-    return mean.at[2].set(wrap_angle(mean[2])), kalman.replace_first(P, slope)
+    pose, slope = seen_pose(seen, velocity_lead, sign=1)
+    mean = seen.at[:3].set(pose.at[2].set(wrap_angle(pose[2])))
+    return mean, kalman.replace_first(P, slope)
 
 
 def _in_body(mean: Array) -> Array:

@@ -256,6 +256,9 @@ def preintegrate(
     )
 
 
+_preintegrate_all = jax.jit(jax.vmap(preintegrate, in_axes=(0, None)))
+
+
 def right_jacobian(turn: Float[Array, " 3"]) -> Float[Array, "3 3"]:
     """J in Exp(turn + d) = Exp(turn) Exp(J d) for small d (Forster et al., Eq. 8)."""
     angle, cross = safe_norm(turn), skew(turn)
@@ -416,11 +419,6 @@ class ImuSamples:
         quiet = np.all(scatter < _STILL_SCATTER * density, axis=1)
         slow = np.all(rate < _STILL_RATE_SIGMAS * self.noise.gyroscope_bias_sigma, axis=1)
         return whole & quiet & slow
-
-
-@jax.jit
-def _preintegrate_all(readings: Readings, noise: ImuNoise) -> Preintegrated:
-    return jax.vmap(lambda rows: preintegrate(rows, noise))(readings)
 
 
 def _cut(

@@ -16,7 +16,7 @@ from jaxnav.core.filter.smooth import Trail, doubt, smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
-from tests.helpers.filters import level
+from tests.helpers.filters import believing, level, predicted
 
 STEPS = 12
 DT_S = 0.1
@@ -108,26 +108,20 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
     )
     z = small * rng.normal(size=(STEPS, 3))
 
-    def correct(moments, measured):
-        mean, P = moments
+    @jax.jit
+    def correct(mean, P, measured):
         innovation = measured - mean[:3]
         correction, P, _ = kalman.update(P, innovation, jnp.asarray(H), jnp.asarray(R))
         return motion.moved(mean, correction), P
 
-    @jax.jit
-    def both_ways(z):
-        measured = nominal[:, :3] + z
-        filtered = [correct((nominal[0], P), measured[0])]
-        for pose in measured[1:]:
-            mean, before = filtered[-1]
-            bank = motion.init(1)
-            bank = dataclasses.replace(bank, mean=mean[None], covariance=before[None])
-            bank = motion.predict(bank, obs)
-            filtered.append(correct((bank.mean[0], bank.covariance[0]), pose))
-        trail = filtered[-1:]
-        for moments in filtered[-2::-1]:
-            trail.insert(0, smoothed(motion, moments, trail[0], obs))
-        return trail
+    measured = np.asarray(nominal[:, :3]) + z
+    filtered = [correct(nominal[0], P, measured[0])]
+    for pose in measured[1:]:
+        bank = predicted(motion, believing(motion, *filtered[-1]), obs)
+        filtered.append(correct(bank.mean[0], bank.covariance[0], pose))
+    trail, back = filtered[-1:], jax.jit(smoothed)
+    for moments in filtered[-2::-1]:
+        trail.insert(0, back(motion, moments, trail[0], obs))
 
     A = np.eye(6) + DT_S * np.eye(6, k=3)
     Q = np.asarray(kalman.white_acceleration(motion.acceleration_density, DT_S))
@@ -148,7 +142,7 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
             information[at, at] += wheels.T @ of_wheels @ wheels
     covariance = np.linalg.inv(information)
     expected = (covariance @ right).reshape(STEPS, 6)
-    for step, (mean, found) in enumerate(both_ways(jnp.asarray(z))):
+    for step, (mean, found) in enumerate(trail):
         block = covariance[6 * step : 6 * step + 6, 6 * step : 6 * step + 6]
         np.testing.assert_allclose(mean - nominal[step], expected[step], atol=1e-4 * small)
         np.testing.assert_allclose(found, block, atol=1e-5 * block.max())

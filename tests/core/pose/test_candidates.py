@@ -284,6 +284,7 @@ def test_on_the_ground_the_minimum_is_scipy_s(pose):
         )
 
 
+@pytest.mark.long  # those of a whole step are in test_hypotheses.py
 @in_float32
 def test_gradients_are_finite(precision):
     """Through unproject, IPPE, pruning, LM and covariance; a frontal view and none at all."""

@@ -228,6 +228,7 @@ def test_sigma_weighs_corners(room):
     np.testing.assert_allclose(half, one / 4, rtol=1e-2)
 
 
+@pytest.mark.long  # test_nuisance.py has them of cameras that are off
 def test_implicit_gradients_are_differences(room):
     rig, markers, obs, T_world_vehicle = room
     noise = 0.3 * np.random.default_rng(6).standard_normal(obs.corners_px.shape)
