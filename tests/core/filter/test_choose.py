@@ -23,6 +23,8 @@ from jaxnav.core.filter.choose import (
     Selection,
     Selector,
     Ungated,
+    judge_branch,
+    position_error_m,
 )
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.markers import MarkerMap
@@ -505,3 +507,33 @@ def test_a_misled_prediction_misleads_the_paper_s_rule(ambiguous):
     _, candidates, snapshot = ambiguous
     mirror = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[0]).inverse()
     assert int(select(PaperCost(), belief(mirror), candidates, snapshot).selected) == 0
+
+
+@pytest.mark.parametrize(
+    ("degrees", "valid", "selected", "expected"),
+    [
+        # judged, wrong, outlier, ambiguous
+        ((1.0, 40.0), [True, True], 0, (True, False, False, True)),
+        ((1.0, 40.0), [True, True], 1, (True, True, False, True)),
+        ((40.0, 41.0), [True, True], 0, (True, False, True, True)),
+        ((40.0, 1.0), [True, False], 0, (True, False, True, False)),
+        ((3.0, 1.0), [True, False], 0, (True, False, False, False)),
+        # Equally far, but for rounding.
+        ((-7.0, 7.0), [True, True], 0, (True, False, False, True)),
+        ((-7.0, 7.0), [True, True], 1, (True, False, False, True)),
+        ((1.0, 40.0), [True, True], -1, (False, False, False, False)),
+        ((1.0, 40.0), [False, False], -1, (False, False, False, False)),
+    ],
+)
+def test_a_branch_is_wrong_when_another_candidate_is_closer_in_angle(
+    degrees, valid, selected, expected
+):
+    seen = candidates_at([(1.0, 2.0, np.deg2rad(angle)) for angle in degrees], [0.0, 1.0], valid)
+    branch = judge_branch(seen, jnp.asarray(selected), worlds.planar(1.0, 2.0, 0.0))
+    told = branch.judged, branch.wrong, branch.outlier, branch.ambiguous
+    assert tuple(map(bool, told)) == expected
+
+
+def test_a_distance_is_that_of_the_positions():
+    here, there = worlds.planar(1.0, 2.0, 0.3), worlds.planar(1.0, 4.0, -0.4)
+    assert position_error_m(here, there) == pytest.approx(2.0)
