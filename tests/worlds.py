@@ -1,6 +1,9 @@
 """Build the worlds that several tests share: rigs, marker maps and observations."""
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,26 +27,45 @@ OVERLAP_VIEW = (0.3, 0.3, np.deg2rad(60.0))
 NO_VIEW = (0.0, 4.0, np.deg2rad(90.0))  # behind the wall
 
 
+Made = TypeVar("Made")
+
+
+def once_a_precision(make: Callable[[], Made]) -> Callable[[], Made]:
+    """Made, or loaded, once in each precision, also where that is asked for within a program."""
+
+    @functools.cache
+    def made(_: np.dtype) -> Made:
+        with jax.ensure_compile_time_eval():
+            return make()
+
+    return functools.wraps(make)(lambda: made(jnp.result_type(float)))
+
+
+@once_a_precision
 def qcar_rig() -> CameraRig:
     """Four equidistant cameras that look front, right, rear, left, exactly where they say."""
     return dataclasses.replace(qcar_rig_by_hand(), extrinsics_sigma=None)
 
 
+@once_a_precision
 def qcar_rig_by_hand() -> CameraRig:
     """The same, as its file says: somewhere near where they say."""
     return load_rig(calib_dir() / "qcar" / "rig.yaml")
 
 
+@once_a_precision
 def qcar() -> Vehicle:
     """The paper's car, its sensors exact but for white noise."""
     return dataclasses.replace(qcar_by_hand(), sensor_sigma=None)
 
 
+@once_a_precision
 def qcar_by_hand() -> Vehicle:
     """The same, as its file says: its sensors are as good as those of any car."""
     return load_vehicle(calib_dir() / "qcar" / "vehicle.yaml")
 
 
+@once_a_precision
 def paper_markers() -> MarkerMap:
     """The paper's only marker: upright, at (0, 1.47) m, facing -y."""
     return load_markers(calib_dir() / "qcar" / "markers.yaml")
@@ -72,6 +94,7 @@ def upright(facing_rad: float) -> np.ndarray:
     return np.array([[-s, 0, c], [c, 0, s], [0, 1, 0]])
 
 
+@once_a_precision
 def room_markers() -> MarkerMap:
     """Four markers on the walls of a room around the origin, of two sizes."""
     return marker_map(
@@ -85,6 +108,7 @@ def room_markers() -> MarkerMap:
     )
 
 
+@once_a_precision
 def handheld_rig() -> CameraRig:
     """Four fisheyes that look along +z, -x, -z and +x of a body, as TagSLAM's rig does."""
     lens = {"lens": "equidistant", "distortion": [-0.02, 0.003, -0.004, 0.001]}

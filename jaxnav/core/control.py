@@ -70,6 +70,11 @@ class Exploration(eqx.Module):
     min_range_m: float = 0.7
     duration_s: float = 12.0
 
+    def goes_on(self, state: ControlState, to_marker_m: Float[Array, " 2"]) -> Bool[Array, ""]:
+        """Whether it moves: it has not explored for too long, and the marker is not too near."""
+        far = safe_norm(to_marker_m) > self.min_range_m
+        return (state.explored_s < self.duration_s) & far
+
 
 class ControlInput(eqx.Module):
     """What a command follows from."""
@@ -242,13 +247,12 @@ class Controller(Follower):
         if to_marker_m is None:
             return state, Command(zero, zero)
         explore, limit = self.exploration, self.vehicle.steering_limit_rad
-        range_m = safe_norm(to_marker_m)
         bearing_rad = safe_atan2(to_marker_m[1], to_marker_m[0])
         nearer_side = jnp.where(bearing_rad > EVEN_RAD, -1.0, 1.0).astype(beta_rad.dtype)
         side = jnp.where(state.side == 0, nearer_side, state.side)
+        goes = explore.goes_on(state, to_marker_m)
         alpha_rad = wrap_angle(bearing_rad + side * explore.angle_rad - beta_rad)
         steering = self._steering(alpha_rad, jnp.asarray(explore.reach_m, limit.dtype), beta_rad)
-        goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
         overshoot = jnp.maximum(self.vehicle.speed_time_constant_s / explore.settle_s - 1, 0)
         short_mps = explore.speed_mps - given.speed_mps
         short_mps = jnp.where(jnp.isfinite(short_mps), short_mps, 0)
@@ -381,7 +385,6 @@ class TwistController(Follower):
         if to_marker_m is None:
             return state, jnp.stack([zero] * 3)
         explore = self.exploration
-        range_m = safe_norm(to_marker_m)
         bearing_rad = safe_atan2(to_marker_m[1], to_marker_m[0])
         left, right = (bearing_rad + side * explore.angle_rad for side in (1, -1))
         turns_less = jnp.abs(jnp.sin(left)) < jnp.abs(jnp.sin(right)) + EVEN_RAD
@@ -393,7 +396,7 @@ class TwistController(Follower):
         reach_m, speed = (jnp.asarray(x, zero.dtype) for x in (explore.reach_m, explore.speed_mps))
         twist = self._twist(alpha_rad, reach_m, speed)
         twist = twist.at[0].multiply(jnp.where(backs, -1, 1))
-        goes = (state.explored_s < explore.duration_s) & (range_m > explore.min_range_m)
+        goes = explore.goes_on(state, to_marker_m)
         return state.exploring(given, side), jnp.where(goes, twist, 0)
 
     def _limited(self, twist: Float[Array, " 3"]) -> Float[Array, " 3"]:

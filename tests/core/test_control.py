@@ -125,6 +125,19 @@ def test_repeated_commands_settle_on_that_arc():
     assert steering == pytest.approx(self_consistent_steering(pose, waypoint), abs=1e-9)
 
 
+def driven(control, speed_mps, servo_rad=np.inf):
+    """Whether a bicycle arrives within 20 s, and its poses; the servo turns so far in a period."""
+    pose, steering, state, poses = np.zeros(3), 0.0, None, []
+    for _ in range(200):
+        state, command, done, _ = act(control, pose, steering, state=state)
+        if done:
+            break
+        steering += np.clip(float(command.steering_rad) - steering, -servo_rad, servo_rad)
+        pose = paper.drive(pose, speed_mps, steering, 0.1, WHEELBASE_M, 20)[-1]
+        poses.append(pose)
+    return bool(done), np.array(poses)
+
+
 @pytest.mark.parametrize("direction_deg", [100, 135, 179, -100, -150])
 def test_a_waypoint_behind_gets_full_lock_and_is_reached(direction_deg):
     direction = np.deg2rad(direction_deg)
@@ -132,14 +145,7 @@ def test_a_waypoint_behind_gets_full_lock_and_is_reached(direction_deg):
     control = controller([waypoint])
     _, command, _, _ = act(control, (0.0, 0.0, 0.0))
     assert command.steering_rad == np.sign(direction_deg) * 0.5
-    pose, steering, state = np.zeros(3), 0.0, None
-    for _ in range(200):
-        state, command, done, _ = act(control, pose, steering, state=state)
-        if done:
-            break
-        steering = float(command.steering_rad)
-        pose = paper.drive(pose, 0.5, steering, 0.1, WHEELBASE_M, 20)[-1]
-    assert done
+    assert driven(control, 0.5)[0]
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -149,16 +155,9 @@ def test_a_waypoint_inside_the_smallest_circle_is_not_orbited(side, distance_m, 
     control = controller([(distance_m * np.cos(direction), distance_m * np.sin(direction))])
     _, command, _, _ = act(control, (0.0, 0.0, 0.0))
     assert command.steering_rad == 0
-    pose, steering, state = np.zeros(3), 0.0, None
-    for _ in range(200):
-        state, command, done, _ = act(control, pose, steering, state=state)
-        if done:
-            break
-        wanted = float(command.steering_rad)
-        steering += np.clip(wanted - steering, -0.5, 0.5)  # the servo's 5 rad/s
-        pose = paper.drive(pose, 0.4, steering, 0.1, WHEELBASE_M, 20)[-1]
-        assert np.linalg.norm(pose[:2]) < 2.0
+    done, poses = driven(control, 0.4, servo_rad=0.5)  # 5 rad/s
     assert done
+    assert np.all(np.linalg.norm(poses[:, :2], axis=1) < 2.0)
 
 
 def test_throttle_is_equation_19():
@@ -414,6 +413,7 @@ def test_derivatives():
     pose = jnp.asarray([2.5, -0.5, 2.3])
     check_derivatives(outcome, pose, jnp.asarray(0.2), control, atol=1e-7)
     # On top of the waypoint, and with it exactly behind.
+    slopes_of = jax.jit(jax.jacrev(outcome, (0, 1)))
     for where in ((1.3, 0.0, 0.4), (2.3, 0.0, 0.0)):
-        slopes = jax.jit(jax.jacrev(outcome, (0, 1)))(jnp.asarray(where), jnp.asarray(0.0), control)
+        slopes = slopes_of(jnp.asarray(where), jnp.asarray(0.0), control)
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))

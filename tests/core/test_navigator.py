@@ -14,13 +14,15 @@ from hypothesis import strategies as st
 
 from jaxnav.core.filter.bank import PoseBelief
 from jaxnav.core.filter.choose import MeasuredPose, PaperCost, Selection
-from jaxnav.core.models.markers import CORNER_SIGNS, MarkerMap
+from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator, Output, State
+from jaxnav.core.parameters import parameters_of, with_parameters
 from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import check_derivatives, in_float32
+from tests.helpers.filters import planar_part
 from tests.reference import kalman, paper
 
 WHEELBASE_M = 0.256
@@ -179,12 +181,7 @@ def reference_pose_covariance(nav: Navigator, pose, sigma_px: float) -> np.ndarr
 
     h = 1e-5
     J = np.stack([(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(6)], axis=1)
-    P = np.linalg.inv(J.T @ J / sigma_px**2)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    to_planar = np.zeros((3, 6))
-    to_planar[:2, :2] = [[c, -s], [s, c]]
-    to_planar[2, 5] = 1
-    return to_planar @ P @ to_planar.T
+    return planar_part(np.linalg.inv(J.T @ J / sigma_px**2), pose[2])
 
 
 def test_the_first_two_steps_by_hand():
@@ -336,26 +333,15 @@ def test_nan_odometry_is_a_step_without_odometry(located):
         )
 
 
-def parameters_of(nav: Navigator) -> dict[str, jax.Array]:
-    """Motion noise and gains: what a tuner varies."""
-    motion, controller = nav.motion, nav.controller
-    return {
-        "acceleration_density": motion.acceleration_density,
-        "corner_sigma_px": nav.corner_sigma_px,
-        "integral_per_ms": controller.integral_per_ms,
-        "odometry_sigma": motion.odometry_sigma,
-        "proportional_per_m": controller.proportional_per_m,
-        "vision_floor": motion.vision_floor,
-    }
+# Motion noise and gains: what a tuner varies.
+TUNED = ("corner_sigma_px", "motion.acceleration_density", "motion.odometry_sigma",
+         "motion.vision_floor", "controller.proportional_per_m",
+         "controller.integral_per_ms")  # fmt: skip
 
 
-def tuned(nav: Navigator, parameters: dict[str, jax.Array]) -> Navigator:
-    """The navigator with these parameters in place of its own."""
-    return eqx.tree_at(
-        lambda n: [parameters_of(n)[key] for key in sorted(parameters)],
-        nav,
-        [parameters[key] for key in sorted(parameters)],
-    )
+def tunable(nav: Navigator) -> dict[str, jax.Array]:
+    known = parameters_of(nav)
+    return {name: known[name] for name in TUNED}
 
 
 def test_derivatives_of_a_step():
@@ -367,11 +353,11 @@ def test_derivatives_of_a_step():
 
     def outcome(corners_px, speed_mps, steering_rad, dt_s, parameters):
         changed = Observation(corners_px, second.visible, speed_mps, steering_rad, dt_s)
-        after, out = tuned(nav, parameters).step(state, changed)
+        after, out = with_parameters(nav, parameters).step(state, changed)
         return after.belief.bank.mean, after.belief.bank.covariance, out.command
 
     arguments = (second.corners_px, second.speed_mps, second.steering_rad, second.dt_s)
-    check_derivatives(outcome, *arguments, parameters_of(nav), step=1e-6, rtol=1e-4, atol=1e-5)
+    check_derivatives(outcome, *arguments, tunable(nav), step=1e-6, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.long
@@ -384,12 +370,12 @@ def test_a_rollout_of_20_steps_has_a_finite_gradient(precision):
     @jax.jit
     @jax.value_and_grad
     def loss(parameters):
-        changed = tuned(nav, parameters)
+        changed = with_parameters(nav, parameters)
         _, out = jax.lax.scan(changed.step, changed.init(), obs)
         error = out.pose - jnp.asarray(true_poses())
         return jnp.sum(error**2) + jnp.sum(out.command.throttle**2) + jnp.sum(out.nis)
 
-    value, gradient = loss(parameters_of(nav))
+    value, gradient = loss(tunable(nav))
     assert np.isfinite(value)
     for name, leaf in gradient.items():
         assert leaf.dtype == precision
@@ -424,6 +410,7 @@ class EachItsOwn(eqx.Module):
         )
 
 
+@pytest.mark.long
 def test_more_hypotheses_need_no_change_to_step():
     """K = 2 through the same step: the reported pose is that of the heavier one."""
     nav = navigator(selector=EachItsOwn())
@@ -475,17 +462,3 @@ def test_what_cannot_be_built_is_told():
         Navigator(rig=rig, markers=markers, waypoints_m=[(1.0, 0.0)])
     with pytest.raises(ValueError, match=r"\(W, 2\)"):
         Navigator(rig=rig, markers=markers, vehicle=worlds.qcar(), waypoints_m=[(1.0, 0.0, 0.0)])
-
-
-def test_the_marker_is_where_the_corners_say():
-    """The first output of a noise-free frame projects the marker onto its corners."""
-    nav, obs = navigator(), at(drive(sigma_px=0.0), 0)
-    _, out = step(nav, nav.init(), obs)
-    assert CORNER_SIGNS.shape == (4, 3)
-    pixels = nav.rig.project(
-        worlds.planar(*np.asarray(out.pose)).inverse(), nav.markers.corners_world_m
-    )
-    visible = np.asarray(obs.visible)
-    np.testing.assert_allclose(
-        np.asarray(pixels)[visible], np.asarray(obs.corners_px)[visible], atol=1e-3
-    )

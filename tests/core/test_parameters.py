@@ -9,14 +9,8 @@ from jaxnav.core.control import ControlInput, ControlState
 from jaxnav.core.filter.choose import LowestReprojection, PaperCost, Ungated
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.planar import BicycleKalman
-from jaxnav.core.models.geometry import safe_atan2, safe_norm, wrap_angle
 from jaxnav.core.models.imu import GYROS
-from jaxnav.core.models.vehicle import (
-    OdometryErrors,
-    TwistBase,
-    default_odometry_sigma,
-    sideslip_rad,
-)
+from jaxnav.core.models.vehicle import OdometryErrors, TwistBase, default_odometry_sigma
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.parameters import TUNABLES, allowed_shapes, parameters_of, with_parameters
 from tests import worlds
@@ -128,31 +122,15 @@ def test_what_does_not_fit_is_named(values, told):
         with_parameters(HANDHELD, {"controller.lookahead_m": jnp.ones(())})
 
 
-def test_what_the_paper_does_not_have_changes_no_bit():
-    """Lookahead and slowing down at infinity, operation by operation: Eqs. 16 to 19 as they are."""
-    control, rng = DRIVER.controller, np.random.default_rng(0)
+def test_what_the_paper_does_not_have_takes_effect_where_it_is_told():
+    """At infinity, its default, the controller is the paper's (`test_control.py`)."""
     zero = jnp.zeros(())
-    for _ in range(20):
-        x_m, y_m, psi_rad, steering_rad = map(jnp.asarray, rng.uniform(-1.5, 1.5, 4) / [1, 1, 1, 3])
-        integral_ms = jnp.asarray(rng.uniform(0, 4))
-        state = ControlState(jnp.asarray(0), integral_ms, zero, zero)
-        pose, yes, no_time = jnp.stack([x_m, y_m, psi_rad]), jnp.asarray(True), zero
-        given = ControlInput(pose, yes, steering_rad, no_time)
-        _, command, _, _ = control.towards(state, given)
-
-        to_waypoint = control.waypoints_m[0] - pose[:2]
-        distance_m = safe_norm(to_waypoint)
-        beta_rad = sideslip_rad(steering_rad)
-        alpha_rad = wrap_angle(safe_atan2(to_waypoint[1], to_waypoint[0]) - psi_rad - beta_rad)
-        steering = control._steering(alpha_rad, distance_m, beta_rad)
-        if control._orbited(alpha_rad, distance_m):
-            steering = zero
-        throttle = control.proportional_per_m * distance_m + control.integral_per_ms * integral_ms
-        assert command.steering_rad == steering
-        assert command.throttle == jnp.minimum(throttle, CAR.throttle_limit)
-    nearer = with_parameters(
-        DRIVER,
-        {"controller.lookahead_m": jnp.asarray(0.5), "controller.slows_at_rad": jnp.asarray(0.3)},
-    ).controller.towards(state, given)[1]
-    assert nearer.steering_rad != command.steering_rad
-    assert nearer.throttle < command.throttle
+    state = ControlState(jnp.asarray(0), zero, zero, zero)
+    given = ControlInput(jnp.asarray([0.2, -0.5, 0.1]), jnp.asarray(True), zero, zero)
+    values = {"controller.lookahead_m": 0.5, "controller.slows_at_rad": 0.3}
+    nearer = with_parameters(DRIVER, {name: jnp.asarray(v) for name, v in values.items()})
+    (_, one, *_), (_, other, *_) = (
+        navigator.controller.towards(state, given) for navigator in (DRIVER, nearer)
+    )
+    assert other.steering_rad != one.steering_rad
+    assert other.throttle < one.throttle

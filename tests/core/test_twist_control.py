@@ -1,6 +1,7 @@
 """The controller of bases that are no cars: they arrive, inside their limits, from anywhere."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -15,29 +16,18 @@ from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.core.navigator import Navigator
 from jaxnav.sim.plant import BaseState, move_base
 from tests import worlds
+from tests.core import test_control
 from tests.derivatives import check_derivatives
 
 DIFFERENTIAL = TwistBase.create(0.8, 3.0, 0.1)
 OMNI = TwistBase.create(0.8, 3.0, 0.1, left_limit_mps=0.3)
-call = eqx.filter_jit(
-    lambda controller, state, *args, **named: controller(state, ControlInput(*args, **named))
-)
 
 
 def controller(base, waypoints_m=((2.0, 0.0),)) -> TwistController:
     return TwistController.along(jnp.asarray(waypoints_m, float), base, waypoint_radius_m=0.15)
 
 
-def act(control, pose, state=None, located=True, dt_s=0.1, **looking):
-    return call(
-        control,
-        control.init() if state is None else state,
-        jnp.asarray(pose, float),
-        jnp.asarray(located),
-        jnp.asarray(np.nan),
-        jnp.asarray(dt_s, float),
-        **{name: jnp.asarray(value) for name, value in looking.items()},
-    )
+act = functools.partial(test_control.act, steering_rad=np.nan)  # which is not looked at
 
 
 def of(command) -> np.ndarray:
@@ -117,10 +107,10 @@ def test_no_command_is_beyond_the_limits(pose, decided, omni):
     assert np.all(np.abs(of(command)) <= np.asarray(base.limits) * (1 + 1e-12))
 
 
-@pytest.mark.parametrize("pose", [(np.nan, 0.0, 0.0), (0.0, 0.0, np.inf), (1e200, 0.0, 0.0)])
-def test_it_stands_where_nothing_is_known(pose):
-    _, command, _, _ = act(controller(DIFFERENTIAL), pose)
-    assert np.all(np.isfinite(of(command)))
+def test_it_stands_where_nothing_is_known():
+    for pose in ((np.nan, 0.0, 0.0), (0.0, 0.0, np.inf), (1e200, 0.0, 0.0)):
+        _, command, _, _ = act(controller(DIFFERENTIAL), pose)
+        assert np.all(np.isfinite(of(command))), pose
     _, command, _, _ = act(controller(OMNI), (0.0, 0.0, 0.0), located=False)
     np.testing.assert_array_equal(of(command), 0)
     state, command, done, _ = act(controller(OMNI), (2.0, 0.1, 0.0))
@@ -155,26 +145,26 @@ def test_exploring_ends_and_starts_anew():
     state, command, _, _ = act(control, (0.0, 0.0, 0.0), **looking)
     assert np.any(of(command) != 0)
     late = dataclasses.replace(state, explored_s=jnp.asarray(13.0))
-    _, command, _, _ = act(control, (0.0, 0.0, 0.0), late, **looking)
+    _, command, _, _ = act(control, (0.0, 0.0, 0.0), state=late, **looking)
     np.testing.assert_array_equal(of(command), 0)
-    state, _, _, _ = act(control, (0.0, 0.0, 0.0), late, **looking | {"decided": True})
+    state, _, _, _ = act(control, (0.0, 0.0, 0.0), state=late, **looking | {"decided": True})
     assert float(state.explored_s) == 0
     assert float(state.side) == 0
 
 
 @pytest.mark.parametrize("base", [DIFFERENTIAL, OMNI], ids=["differential", "omni"])
-@pytest.mark.parametrize("pose", [(0.1, 0.3, 0.4), (2.0, 0.0, 0.0), (0.0, 0.0, 0.0)])
-def test_derivatives(base, pose):
+def test_derivatives(base):
+    """Also on the waypoint, and where it is straight ahead."""
     control = controller(base)
 
     def twist(pose):
         true, zero = jnp.asarray(True), jnp.zeros(())
         return control.towards(control.init(), ControlInput(pose, true, zero, zero))[1]
 
-    if pose == (0.1, 0.3, 0.4):
-        check_derivatives(twist, jnp.asarray(pose))
-    else:
-        slopes = jax.jit(jax.jacrev(twist))(jnp.asarray(pose))
+    check_derivatives(twist, jnp.asarray([0.1, 0.3, 0.4]))
+    slopes_of = jax.jit(jax.jacrev(twist))
+    for x_m in (2.0, 0.0):
+        slopes = slopes_of(jnp.asarray([x_m, 0.0, 0.0]))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
 
 

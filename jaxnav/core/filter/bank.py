@@ -31,8 +31,6 @@ _PAUSE_S = 1.0
 # Hypotheses that a mirror exchanges weigh the same but for rounding, 1e-4 after a second of frames
 # in float32; what tells them apart in truth soon tells more than this.
 EVEN_LOG_WEIGHT = 1e-3
-# A time is up where less than this is left: it adds up from intervals, and has their rounding.
-_NO_TIME_S = 1e-3
 
 
 class CameraErrors(eqx.Module):
@@ -168,15 +166,6 @@ def forget_lost(bank: Bank, lost: Bool[Array, " K"], dt_s: Float[Array, ""] | fl
     )
 
 
-def contradicted(
-    bank: Bank, max_count: int, max_duration_s: Float[Array, ""] | float
-) -> Bool[Array, " K"]:
-    """Whether `max_count` rejections in a row agree, or they have lasted `max_duration_s`."""
-    rejections = bank.rejections
-    lasted = rejections.duration_s >= max_duration_s - _NO_TIME_S
-    return (rejections.count >= max_count) | lasted
-
-
 def cleared(rejections: Rejections, over: Bool[Array, "*K"]) -> Rejections:
     """Forget the rejections that are over."""
     return where(over, jax.tree.map(jnp.zeros_like, rejections), rejections)
@@ -271,20 +260,16 @@ def apply_gate(
     accepted = offered & (nis <= offer.gate_nis * offer.inflation)
     predicted = (bank.mean, bank.covariance)
     mean, covariance = where(accepted, offer.posterior, where(starts, first, predicted))
-    return (
-        Bank(
-            mean,
-            covariance,
-            bank.log_weight,
-            bank.initialised | valid,
-            cleared(_and_another(bank.rejections, offered, offer.innovation), agrees | starts),
-            bank.number,
-            bank.velocity_lead,
-            jnp.where(starts, -1, bank.parent),
-        ),
-        jnp.where(offered, nis, 0),
-        accepted | starts,
+    rejections = _and_another(bank.rejections, offered, offer.innovation)
+    after = dataclasses.replace(
+        bank,
+        mean=mean,
+        covariance=covariance,
+        initialised=bank.initialised | valid,
+        rejections=cleared(rejections, agrees | starts),
+        parent=jnp.where(starts, -1, bank.parent),
     )
+    return after, jnp.where(offered, nis, 0), accepted | starts
 
 
 def _and_another(

@@ -130,22 +130,10 @@ class ErrorsInView(eqx.Module):
         )
         return ErrorsInView(mean, by_pose, root, rows, slopes)
 
-    def nuisance(self, places: Nuisance) -> Nuisance:
-        """w, which moves the residuals, the places eliminated, by slopes' root w."""
-        slopes = places.eliminated(self.slopes[..., None])[..., 0]
-        return Nuisance.from_slopes(self._moved(self.root, slopes)[:, :, None])
 
-    def offset(self) -> Float[Array, "m K"]:
-        """By how much the mean moves the residuals."""
-        return jnp.sum(self.mean[:, None] * self.slopes[..., None], axis=0)
-
-    def with_pose(self) -> Float[Array, "d m K"]:
-        """Derivative of the residuals by u through the errors that come with it."""
-        return self._moved(self.by_pose, self.slopes)
-
-    @staticmethod
-    def _moved(by: Float[Array, "t n K"], slopes: Float[Array, "t m"]) -> Float[Array, "n m K"]:
-        return jnp.sum(by[:, :, None] * slopes[:, None, :, None], axis=0)
+def _moved(by: Float[Array, "t n K"], slopes: Float[Array, "t m"]) -> Float[Array, "n m K"]:
+    """Derivative of residuals with these slopes by what moves the errors by `by`."""
+    return jnp.sum(by[:, :, None] * slopes[:, None, :, None], axis=0)
 
 
 def common_turn(errors: ErrorsPosterior, sigma_rad: Float[Array, "C 3"]) -> Float[Array, "e 3"]:
@@ -224,7 +212,8 @@ class Nuisances(eqx.Module):
         if moves is not None and errors is not None:
             in_view = ErrorsInView.at_predictions(root, prior.freedom, errors, moves)
             places = Nuisance.from_slopes(moves.places[..., None])
-            cameras = in_view.nuisance(places)
+            slopes = places.eliminated(in_view.slopes[..., None])[..., 0]
+            cameras = Nuisance.from_slopes(_moved(in_view.root, slopes)[:, :, None])
         elif moves is not None:
             cameras = moves.nuisance()
         _, slope = reprojection_rows(snapshot.rig, snapshot.seen)(corners)
@@ -244,7 +233,8 @@ class Nuisances(eqx.Module):
         """Residuals (m, K) by the errors' mean, and by what comes with the pose u, (d, m, K)."""
         if self.in_view is None:
             return None
-        return self.in_view.offset(), self.in_view.with_pose()
+        mean, by_pose, slopes = self.in_view.mean, self.in_view.by_pose, self.in_view.slopes
+        return jnp.sum(mean[:, None] * slopes[..., None], axis=0), _moved(by_pose, slopes)
 
     def eliminated(self, rows: Float[Array, "*n m K"]) -> Float[Array, "*n rows K"]:
         """Eliminate the errors from residuals, or from derivatives; their priors add rows."""

@@ -39,15 +39,11 @@ from jaxnav.core.linalg.small_matrices import (
     solve_lower,
     solve_upper,
 )
-from jaxnav.core.models.geometry import (
-    cayley,
-    cayley_jacobian,
-    inverse_cayley_jacobian,
-    rotation_matrix,
-)
+from jaxnav.core.models.geometry import cayley, cayley_jacobian, inverse_cayley_jacobian
 from jaxnav.core.pose.observation import Snapshot, log_sigmas
 from jaxnav.core.pose.residuals import (
     cross_product,
+    in_frames,
     jacobian_by_twist,
     reprojection_rows,
     turn_arms,
@@ -101,7 +97,8 @@ def fit_poses(
     usable = jnp.all(jnp.isfinite(P), axis=(1, 2)) & (jnp.min(variances, axis=1) > 0)
     root = jax.vmap(cholesky)(jnp.where(usable[:, None, None], P, eye[None]))
     spread = jax.vmap(lambda L: product(freedom, L))(root)
-    corners = _corners(T_world_prior, snapshot)
+    corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
+    corners = in_frames(T_world_prior.inverse(), corners_world)
     nuisances = Nuisances.at_predictions(corners, root, errors, prior, snapshot)
     linearised = _linearised(corners, jnp.moveaxis(spread, 0, -1), nuisances, snapshot)
 
@@ -143,15 +140,6 @@ def fit_poses(
         nuisances.errors_at_best(u, *raw),
     )
     return fused
-
-
-def _corners(T_world_prior: jaxlie.SE3, snapshot: Snapshot) -> Float[Array, "3 P K"]:
-    """The corners in view in the frame of each prediction, m."""
-    corners_world = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
-    T_prior_world = T_world_prior.inverse()
-    R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_prior_world.rotation()), 0, -1)
-    shift = T_prior_world.translation().T[:, None]
-    return jnp.sum(R[:, :, None] * corners_world.T[None, :, :, None], axis=1) + shift
 
 
 def _linearised(

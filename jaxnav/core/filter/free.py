@@ -15,7 +15,6 @@ from jaxnav.core.filter.bank import (
     Bank,
     CameraErrors,
     Moments,
-    Offer,
     PoseBelief,
     empty_bank,
     forget_lost,
@@ -25,7 +24,7 @@ from jaxnav.core.filter.bank import (
 from jaxnav.core.filter.choose import MeasuredPose
 from jaxnav.core.filter.errors import EACH, common_turn, schmidt_update_along
 from jaxnav.core.filter.motion import Motion, Planar, camera_states, follow_pose
-from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich, where
+from jaxnav.core.linalg.small_matrices import matvec, product, sandwich, where
 from jaxnav.core.models.geometry import (
     cayley,
     inverse_cayley,
@@ -73,54 +72,42 @@ class FreeBody(Motion):
         mean = mean.at[7 : 7 + rest.shape[0]].set(rest.astype(dtype))
         return empty_bank(mean, jnp.eye(count, dtype=dtype), 6, hypotheses)
 
-    def without_lost(
-        self,
-        before: Bank,
-        mean: Float[Array, "K n"],
-        covariance: Float[Array, "K d d"],
-        dt_s: Float[Array, ""],
-    ) -> Bank:
-        """Take over predicted moments, and drop hypotheses that are contradicted or nowhere."""
-        bank = eqx.tree_at(lambda b: (b.mean, b.covariance), before, (mean, covariance))
-        variance_m2 = jnp.max(jnp.diagonal(covariance, axis1=1, axis2=2)[:, :3], axis=1)
-        lost = self.lost(before) | ~(variance_m2 < self.lost_sigma_m**2)
-        return forget_lost(bank, lost, dt_s)
+    def predict(self, bank: Bank, obs: Observation) -> Bank:
+        """The bank `obs.dt_s` later; see `evolve`.
+
+        A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
+        position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
+        """
+        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
+        later = eqx.tree_at(lambda b: (b.mean, b.covariance), bank, moments)
+        variance_m2 = jnp.max(jnp.diagonal(later.covariance, axis1=1, axis2=2)[:, :3], axis=1)
+        lost = self.lost(bank) | ~(variance_m2 < self.lost_sigma_m**2)
+        return forget_lost(later, lost, jnp.asarray(obs.dt_s, bank.mean.dtype))
 
     def poses(self, bank: Bank) -> PoseBelief:
         """The pose part of the state: free in six directions, without nuisances."""
+        P, errors = bank.covariance, None
+        if self.camera_states:
+            at = P.shape[-1] - self.camera_states
+            errors = CameraErrors(bank.mean[:, at + 1 :], P[:, at:, at:], P[:, :6, at:])
         return PoseBelief(
             jaxlie.SE3(bank.mean[:, :7]),
-            bank.covariance[:, :6, :6],
+            P[:, :6, :6],
             bank.log_weight,
             bank.initialised,
             jnp.eye(6, dtype=bank.mean.dtype),
             jnp.zeros((6, 0), bank.mean.dtype),
             self.gate_nis,
-            self._camera_errors(bank),
+            errors,
         )
 
-    def _camera_errors(self, bank: Bank) -> CameraErrors | None:
-        if not self.camera_states:
-            return None
-        P = bank.covariance
-        behind = P.shape[-1] - self.camera_states
-        return CameraErrors(bank.mean[:, behind + 1 :], P[:, behind:, behind:], P[:, :6, behind:])
-
-    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+    def compared(
+        self, bank: Bank, measured: MeasuredPose
+    ) -> tuple[Float[Array, " 6"], Float[Array, "6 6"], Float[Array, "6 6"]]:
         """See `Motion`, in 6 dof."""
-        mean, P = bank.mean, bank.covariance
-        log_volume = log_det(cholesky(measured.covariance)) / 2
+        away = jaxlie.SE3(bank.mean[:7]).inverse() @ measured.T_world_vehicle
         R = measured.covariance + kalman.as_covariance(self.vision_floor)
-        innovation = inverse_cayley(jaxlie.SE3(mean[:7]).inverse() @ measured.T_world_vehicle)
-        correction, posterior, S = kalman.update(P, innovation, jnp.eye(6, dtype=P.dtype), R)
-        return Offer(
-            kalman.whiten(innovation, S),
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood
-            + log_volume
-            + kalman.log_likelihood(innovation, S),
-            posterior=(self.moved(mean, correction), posterior),
-        )
+        return inverse_cayley(away), jnp.eye(6, dtype=bank.mean.dtype), R
 
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """See `Motion`, in 6 dof."""
@@ -248,7 +235,7 @@ class ConstantVelocity(FreeBody):
     )
     odometry_errors: OdometryErrors | None = None  # None: white noise is all that it gets wrong
 
-    def predict(self, bank: Bank, obs: Observation) -> Bank:
+    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
         """T = T exp(u dt),  P = F P F' + Q.
 
         u is the twist of the state, F = [Ad(exp(-u dt)), dt I; 0, I] and Q that of a white
@@ -259,15 +246,7 @@ class ConstantVelocity(FreeBody):
         with the drift D in the interval, and the twist at its end off its mean by A dt / 3, A the
         density of the acceleration. Errors of the odometry turn and scale u, and F has their
         derivatives of pose and twist.
-
-        A hypothesis is forgotten, and started anew by its next pose, where the sigma of its
-        position exceeds `lost_sigma_m` or the gate has contradicted it too often or too long.
         """
-        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
-        return self.without_lost(bank, *moments, jnp.asarray(obs.dt_s, bank.mean.dtype))
-
-    def evolve(self, mean: Float[Array, " n"], P: Float[Array, "d d"], obs: Observation) -> Moments:
-        """One hypothesis `obs.dt_s` later; see `predict`."""
         dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
         Q = kalman.white_acceleration(self.acceleration_density, dt_s).astype(dtype)
         read, twist = self._twist_read(obs, dtype)

@@ -19,7 +19,7 @@ Alspach, Sorenson (1972) (Gaussian sums).
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -54,7 +54,7 @@ from jaxnav.core.models.geometry import (
     shift_and_turn,
     wrap_angle,
 )
-from jaxnav.core.pose.candidates import SAME_POSE_RAD
+from jaxnav.core.pose.candidates import SAME_POSE_RAD, excess_of_best
 from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.refine import Candidates
 
@@ -375,7 +375,11 @@ class MultiHypothesis(eqx.Module):
         starts = any_seen & ~jnp.any(prior.initialised) & jnp.any(candidates.valid)
         count, bank = prior.log_weight.shape[0], prior
         if count == self.hypotheses:  # a bank is cut only where none of its hypotheses starts
-            bank = _started(starts, prior, candidates, snapshot)
+            new: PoseBelief = jax.lax.cond(
+                starts, lambda: fan(prior, candidates, snapshot, count), lambda: prior
+            )
+            same = {name: getattr(prior, name) for name in ("freedom", "nuisance", "gate_nis")}
+            bank = dataclasses.replace(new, **same)
         floor = jnp.repeat(jnp.asarray([self.floor_m, self.floor_rad]), 3)
         # All slots take as many steps as the slowest, so an empty slot repeats the heaviest one.
         alive_before = jnp.where(bank.initialised, bank.log_weight, -jnp.inf)
@@ -548,25 +552,7 @@ class MultiHypothesis(eqx.Module):
         return jnp.concatenate([self.linear_rad * jnp.tile(nearest_m[:, None], 3), turns], 1)
 
 
-def _started(
-    starts: Bool[Array, ""], prior: PoseBelief, candidates: Candidates, snapshot: Snapshot
-) -> PoseBelief:
-    """Start a new fan where no hypothesis is initialised; elsewhere it costs nothing."""
-
-    def changing(bank: PoseBelief) -> tuple[Any, ...]:
-        pose = bank.T_world_vehicle.wxyz_xyz, bank.covariance
-        return *pose, bank.log_weight, bank.initialised, bank.errors
-
-    wxyz_xyz, *rest = jax.lax.cond(
-        starts,
-        lambda: changing(fan(prior, candidates, snapshot, prior.log_weight.shape[0])),
-        lambda: changing(prior),
-    )
-    return eqx.tree_at(changing, prior, (wxyz_xyz, *rest), is_leaf=lambda leaf: leaf is None)
-
-
 def _misfit(candidates: Candidates, snapshot: Snapshot) -> Float[Array, ""]:
-    """By how much the best candidate misfits (`excess_of`); 1 without a candidate."""
-    cost = candidates.least_cost
-    freedom = jnp.maximum(8 * jnp.sum(snapshot.seen.visible) - 6, 2).astype(cost.dtype)
-    return excess_of(jnp.where(jnp.isfinite(cost), cost, 0), freedom)
+    """By how much the best candidate misfits, at least 1; 1 without a candidate."""
+    excess = excess_of_best(candidates, snapshot.seen)
+    return jnp.maximum(jnp.where(jnp.isfinite(excess), excess, 0), 1)

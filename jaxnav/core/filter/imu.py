@@ -88,9 +88,7 @@ class InertialMotion(FreeBody):
         At rest velocity and turn rate are zero: that tells the biases and the lean, and weighs the
         hypotheses as every measurement does.
         """
-        moments = jax.vmap(lambda mean, P: self.evolve(mean, P, obs))(bank.mean, bank.covariance)
-        dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
-        predicted = self.without_lost(bank, *moments, dt_s)
+        predicted = FreeBody.predict(self, bank, obs)
         read, imu = self._imu_read(obs, bank.mean.dtype)
         return predicted if imu is None else self._rested(predicted, read & imu.still)
 

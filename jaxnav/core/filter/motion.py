@@ -29,7 +29,6 @@ from jaxnav.core.filter.bank import (
     PoseBelief,
     apply_gate,
     branched,
-    contradicted,
     merge_hypotheses,
     restart_broken,
 )
@@ -38,6 +37,7 @@ from jaxnav.core.filter.errors import EACH, ridge
 from jaxnav.core.linalg.small_matrices import (
     cholesky,
     gram,
+    log_det,
     matvec,
     product,
     sandwich,
@@ -47,6 +47,9 @@ from jaxnav.core.linalg.small_matrices import (
 from jaxnav.core.models.geometry import inverse_cayley, inverse_cayley_jacobian
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import Observation
+
+# A time is up where less than this is left: it adds up from intervals, and has their rounding.
+_NO_TIME_S = 1e-3
 
 
 def follow_pose(
@@ -169,30 +172,48 @@ class Motion(eqx.Module):
 
     def lost(self, bank: Bank) -> Bool[Array, " K"]:
         """Hypotheses that the gate has contradicted too often or too long: `predict` drops them."""
-        return contradicted(bank, self.max_rejections, self.max_rejected_s)
+        lasted = bank.rejections.duration_s >= self.max_rejected_s - _NO_TIME_S
+        return (bank.rejections.count >= self.max_rejections) | lasted
 
     @abc.abstractmethod
     def poses(self, bank: Bank) -> PoseBelief:
         """Poses, covariances and weights of the hypotheses, for a selector."""
 
     @abc.abstractmethod
-    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """Fuse one hypothesis with a candidate that its selector has chosen (Eqs. 10 and 11)."""
+    def compared(
+        self, bank: Bank, measured: MeasuredPose
+    ) -> tuple[Float[Array, " m"], Float[Array, "m h"], Float[Array, "m m"]]:
+        """A measured pose less the predicted one, its derivative by the first h states, and R."""
 
     @abc.abstractmethod
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """Take over a pose that the selector has corrected, and correct the rest."""
 
     def offer(self, bank: Bank, measured: MeasuredPose) -> Offer:
-        """Correct one hypothesis by a pose, for the gate to take or leave."""
-        if measured.innovation is None:
-            return self.fused(bank, measured)
+        """Correct one hypothesis by a pose, for the gate to take or leave.
+
+        A candidate that the selector has chosen is fused (Eqs. 10 and 11), a pose that it has
+        corrected is adopted.
+        """
+        if measured.innovation is not None:
+            return Offer(
+                measured.innovation,
+                self.adopted(bank, measured),
+                self.gate_nis,
+                measured.log_likelihood,
+                1.0 if measured.inflation is None else measured.inflation,
+            )
+        innovation, H, R = self.compared(bank, measured)
+        correction, posterior, S = kalman.update(bank.covariance, innovation, H, R)
+        # Directions that were not free have the variance 0.
+        fitted = measured.covariance
+        fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
+        log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
         return Offer(
-            measured.innovation,
-            self.adopted(bank, measured),
+            kalman.whiten(innovation, S),
+            (self.moved(bank.mean, correction), posterior),
             self.gate_nis,
-            measured.log_likelihood,
-            1.0 if measured.inflation is None else measured.inflation,
+            measured.log_likelihood + log_volume + kalman.log_likelihood(innovation, S),
         )
 
     @abc.abstractmethod

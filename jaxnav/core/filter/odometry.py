@@ -200,46 +200,24 @@ def velocity_lead_after(
 
 
 def seen_pose(
-    mean: Float[Array, " n"], velocity_lead: Float[Array, " 3"]
+    mean: Float[Array, " n"], velocity_lead: Float[Array, " 3"], sign: int = -1
 ) -> tuple[Float[Array, " 3"], Float[Array, "3 h"]]:
     """Where the corners show the vehicle, and its derivative by the states before the cameras'.
 
     The derivative leaves out that the lead turns with the heading.
+
+    Args:
+        sign: 1 leads back: from a state whose pose is the seen one to the pose at its stamp.
     """
-    slope = _sheared(mean, velocity_lead, -1)
-    return (mean[:3] if mean.shape[0] == SIX else mean[:3] - _way_since(mean, velocity_lead)), slope
-
-
-def from_seen(
-    mean: Float[Array, " n"], velocity_lead: Float[Array, " 3"]
-) -> tuple[Float[Array, " n"], Float[Array, "3 h"]]:
-    """The state of one whose first three entries are the seen pose, and their derivative by it.
-
-    Of the derivative, the columns of the cameras' errors are left out: they are 0.
-    """
-    if mean.shape[0] == SIX:
-        return mean, _sheared(mean, velocity_lead, 1)
-    return mean.at[:3].add(_way_since(mean, velocity_lead)), _sheared(mean, velocity_lead, 1)
-
-
-def _way_since(mean: Array, velocity_lead: Array) -> Array:
-    """tau (v - c l), by which the vehicle has moved since it was seen."""
-    tau = mean[_DELAY]
-    part = jnp.clip(tau / (2 * MEMORY_S), 0, 1)
-    return tau * (mean[3:SIX] - part * matvec(planar_rotation(mean[2]), velocity_lead))
-
-
-def _sheared(mean: Array, velocity_lead: Array, sign: int) -> Array:
-    """Derivative of pose + sign tau (v - c l)."""
     slope = jnp.eye(3, min(mean.shape[0], SENSORS_END), dtype=mean.dtype)
     if mean.shape[0] == SIX:
-        return slope
-    tau = mean[_DELAY]
+        return mean[:3], slope
+    tau, lead = mean[_DELAY], matvec(planar_rotation(mean[2]), velocity_lead)
+    way = tau * (mean[3:SIX] - jnp.clip(tau / (2 * MEMORY_S), 0, 1) * lead)
     # d (tau c) / d tau
     grown = jnp.where(tau < 2 * MEMORY_S, jnp.maximum(tau, 0) / MEMORY_S, 1)
-    by_delay = mean[3:SIX] - grown * matvec(planar_rotation(mean[2]), velocity_lead)
     slope = slope.at[:, 3:SIX].set(sign * tau * jnp.eye(3, dtype=mean.dtype))
-    return slope.at[:, _DELAY].set(sign * by_delay)
+    return mean[:3] + sign * way, slope.at[:, _DELAY].set(sign * (mean[3:SIX] - grown * lead))
 
 
 # Below these the wheels stand: above the noise of an odometer, below what a wheel creeps at.

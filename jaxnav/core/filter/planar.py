@@ -15,7 +15,6 @@ from jaxnav.core.filter.bank import (
     Bank,
     CameraErrors,
     Moments,
-    Offer,
     PoseBelief,
     empty_bank,
     forget_lost,
@@ -31,7 +30,6 @@ from jaxnav.core.filter.odometry import (
     ReadVelocity,
     Turn,
     bias_at_rest,
-    from_seen,
     gyro_variance,
     read_velocity,
     seen_pose,
@@ -41,7 +39,7 @@ from jaxnav.core.filter.odometry import (
     turned,
     velocity_lead_after,
 )
-from jaxnav.core.linalg.small_matrices import cholesky, log_det, matvec, product, sandwich
+from jaxnav.core.linalg.small_matrices import matvec, product, sandwich
 from jaxnav.core.models.geometry import (
     OFF_GROUND,
     ON_GROUND,
@@ -52,7 +50,6 @@ from jaxnav.core.models.geometry import (
     safe_norm,
     wrap_angle,
 )
-from jaxnav.core.models.imu import Gyro
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import TwistBase, Vehicle
 from jaxnav.core.pose.observation import Observation
@@ -126,13 +123,24 @@ class BicycleKalman(Motion):
 
         A hypothesis that the gate has contradicted too often or too long is forgotten.
         """
-        dt_s = jnp.asarray(obs.dt_s, bank.mean.dtype)
+        dtype, gyro = bank.mean.dtype, self.vehicle.gyro
+        dt_s = jnp.asarray(obs.dt_s, dtype)
+        turn_sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(dtype)
 
         def one(mean: Array, P: Array, velocity_lead: Array) -> tuple[Array, Array, Array]:
-            if self.vehicle.gyro is None:
-                later, P = self._read(*self.evolve(mean, P, obs), obs)
+            turn = self._turn(obs, mean)
+            later, P = self._later(mean, P, obs, turn)
+            if turn is None or gyro is None:
+                later, P = self._with_odometry(later, P, obs, dt_s)
             else:
-                later, P = self._with_gyro(self.vehicle.gyro, mean, P, obs)
+                if self.vehicle.sensor_sigma is not None:
+                    read = read_velocity(self.vehicle, obs, later)
+                    later, P = slip_of(turn, read, turn_sigma_radps, later, P)
+                later, P = self._with_odometry(later, P, obs, dt_s, turn.measured)
+                read = read_velocity(self.vehicle, obs, later)
+                told = turn, mean[3:5], read, turn_sigma_radps, dt_s
+                later, P = bias_at_rest(gyro, *told, later, P)
+                later = later.at[2].set(wrap_angle(later[2]))
             change = _in_body(later) - _in_body(mean)
             return later, P, velocity_lead_after(velocity_lead, change, dt_s)
 
@@ -145,9 +153,7 @@ class BicycleKalman(Motion):
 
     def evolve(self, mean: Float[Array, " n"], P: Float[Array, "n n"], obs: Observation) -> Moments:
         """One hypothesis before its odometry measures it; see `predict`."""
-        turn = None
-        if self.vehicle.gyro is not None:
-            turn = self._turn(self.vehicle.gyro, obs, mean)
+        turn = self._turn(obs, mean)
         later, P = self._later(mean, P, obs, turn)
         dt_s = jnp.asarray(obs.dt_s, mean.dtype)
         return later, self._stepped(later, P, obs, dt_s, None if turn is None else turn.measured)
@@ -183,27 +189,15 @@ class BicycleKalman(Motion):
             errors,
         )
 
-    def fused(self, bank: Bank, measured: MeasuredPose) -> Offer:
+    def compared(
+        self, bank: Bank, measured: MeasuredPose
+    ) -> tuple[Float[Array, " 3"], Float[Array, "3 h"], Float[Array, "3 3"]]:
         """See `Motion`, in 3 dof."""
-        P = bank.covariance
-        pose = planar_from_T_world_vehicle(measured.T_world_vehicle)
-        R = planar_covariance(measured.T_world_vehicle, measured.covariance)
-        # Height, roll and pitch were fitted as well, or were not free: then their variances are 0.
-        fitted = measured.covariance
-        fixed = (jnp.diagonal(fitted) <= 0).astype(fitted.dtype)
-        log_volume = log_det(cholesky(fitted + jnp.diag(fixed))) / 2
-        R = R + kalman.as_covariance(self.vision_floor)
+        T = measured.T_world_vehicle
         seen, slope = seen_pose(bank.mean, bank.velocity_lead)
-        innovation = self.difference(pose, seen)
-        correction, posterior, S = kalman.update(P, innovation, slope, R)
-        return Offer(
-            kalman.whiten(innovation, S),
-            gate_nis=self.gate_nis,
-            log_likelihood=measured.log_likelihood
-            + log_volume
-            + kalman.log_likelihood(innovation, S),
-            posterior=(self.moved(bank.mean, correction), posterior),
-        )
+        gap = self.difference(planar_from_T_world_vehicle(T), seen)
+        R = planar_covariance(T, measured.covariance) + kalman.as_covariance(self.vision_floor)
+        return gap, slope, R
 
     def adopted(self, bank: Bank, measured: MeasuredPose) -> Moments:
         """See `Motion`, in 3 dof."""
@@ -322,23 +316,12 @@ class BicycleKalman(Motion):
             P = P.at[-1, -1].add(jnp.asarray(self.vehicle.gyro.bias_walk, dtype) ** 2 * dt_s)
         return slipped(later, P, way_m, self._slip_sigma(), length_m)
 
-    def _turn(self, gyro: Gyro, obs: Observation, mean: Array) -> Turn:
+    def _turn(self, obs: Observation, mean: Array) -> Turn | None:
+        """What the gyro says of the interval; None without one."""
+        if self.vehicle.gyro is None:
+            return None
         density = kalman.as_matrix(self.acceleration_density)[2, 2].astype(mean.dtype)
-        return turn_of(gyro, obs, mean, density)
-
-    def _with_gyro(self, gyro: Gyro, mean: Array, P: Array, obs: Observation) -> Moments:
-        """The state `dt_s` later, by a gyro and the odometry (`odometry.py`)."""
-        dtype, dt_s = mean.dtype, jnp.asarray(obs.dt_s, mean.dtype)
-        sigma_radps = jnp.sqrt(kalman.as_covariance(self.odometry_sigma)[2, 2]).astype(dtype)
-        turn, before_mps = self._turn(gyro, obs, mean), mean[3:5]
-        mean, P = self._later(mean, P, obs, turn)
-        if self.vehicle.sensor_sigma is not None:
-            read = read_velocity(self.vehicle, obs, mean)
-            mean, P = slip_of(turn, read, sigma_radps, mean, P)
-        mean, P = self._with_odometry(mean, P, obs, dt_s, turn.measured)
-        read = read_velocity(self.vehicle, obs, mean)
-        mean, P = bias_at_rest(gyro, turn, before_mps, read, sigma_radps, dt_s, mean, P)
-        return mean.at[2].set(wrap_angle(mean[2])), P
+        return turn_of(self.vehicle.gyro, obs, mean, density)
 
     def _with_odometry(
         self,
@@ -350,13 +333,20 @@ class BicycleKalman(Motion):
     ) -> Moments:
         """Update a state by the velocity that the odometry reads at its heading, and by its step.
 
-        What the sensors read says nothing of their own errors, which are only considered.
-
-        Args:
-            since_s: time of the prediction, in which the velocity has changed.
-            turns: whether a gyro has measured the turn, so that the wheels' is not looked at.
+        What the sensors read says nothing of their own errors, which are only considered. `since_s`
+        is the time of the prediction; where a gyro has measured the turn, `turns`, the wheels' is
+        not looked at.
         """
-        return self._read(mean, self._stepped(mean, P, obs, since_s, turns), obs, turns)
+        P = self._stepped(mean, P, obs, since_s, turns)
+        read = read_velocity(self.vehicle, obs, mean)
+        H = jnp.eye(3, SIX, k=3, dtype=mean.dtype).at[:, 2].set(-read.by_heading)
+        H = jnp.concatenate([H, -read.by_errors], axis=1)
+        R = sandwich(planar_rotation(mean[2]), kalman.as_covariance(self.odometry_sigma))
+        change, present = read.velocity - mean[3:SIX], _present(read, turns)
+        rows = kalman.hide_rows(change, H, R.astype(mean.dtype), present)
+        correction, after, _ = kalman.update(P, *rows)
+        corrected = self.moved(mean, correction), after
+        return self.schmidt_update(jnp.asarray(False), (mean, P), corrected)
 
     def _stepped(
         self, mean: Array, P: Array, obs: Observation, since_s: Array | float, turns: Array | None
@@ -367,21 +357,6 @@ class BicycleKalman(Motion):
         dt_s = jnp.asarray(since_s, mean.dtype)
         moments = jnp.stack([dt_s**2 / 3, dt_s / 2, dt_s / 2, jnp.ones_like(dt_s)]).reshape(2, 2)
         return P.at[:SIX, :SIX].add(jnp.kron(moments, step[:, None] * step[None]))
-
-    def _read(self, mean: Array, P: Array, obs: Observation, turns: Array | None = None) -> Moments:
-        """Update a state by the velocity that the odometry reads."""
-        dtype = mean.dtype
-        read = read_velocity(self.vehicle, obs, mean)
-        H = jnp.eye(3, SIX, k=3, dtype=dtype).at[:, 2].set(-read.by_heading)
-        H = jnp.concatenate([H, -read.by_errors], axis=1)
-        R = sandwich(planar_rotation(mean[2]), kalman.as_covariance(self.odometry_sigma)).astype(
-            dtype
-        )
-        change, present = read.velocity - mean[3:SIX], _present(read, turns)
-        correction, after, _ = kalman.update(P, *kalman.hide_rows(change, H, R, present))
-        return self.schmidt_update(
-            jnp.asarray(False), (mean, P), (self.moved(mean, correction), after)
-        )
 
 
 def _present(read: ReadVelocity, turns: Array | None) -> Float[Array, " 3"]:
@@ -400,8 +375,9 @@ def planar_poses(
 
 def _at_stamp(seen: Array, P: Array, velocity_lead: Array) -> Moments:
     """A state at its stamp, of one whose first three entries are the seen pose."""
-    mean, slope = from_seen(seen, velocity_lead)
-    return mean.at[2].set(wrap_angle(mean[2])), kalman.replace_first(P, slope)
+    pose, slope = seen_pose(seen, velocity_lead, sign=1)
+    mean = seen.at[:3].set(pose.at[2].set(wrap_angle(pose[2])))
+    return mean, kalman.replace_first(P, slope)
 
 
 def _in_body(mean: Array) -> Array:

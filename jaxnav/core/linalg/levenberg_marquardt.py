@@ -66,10 +66,10 @@ class LanewiseSolver(optx.AbstractLeastSquaresSolver):
         fn: Any,
         y: PyTree,
         aux: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: PyTree,
-        tags: frozenset[object],
+        args: Any,
+        options: Any,
+        state: Any,
+        tags: Any,
         result: optx.RESULTS,
     ) -> tuple[PyTree, PyTree, dict[str, Any]]:
         """The accepted points as they are."""
@@ -97,14 +97,7 @@ class NielsenLM(LanewiseSolver):
         """The unknowns after a move."""
 
     def init(
-        self,
-        fn: Any,
-        y: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        f_struct: PyTree,
-        aux_struct: PyTree,
-        tags: frozenset[object],
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: PyTree, tags: Any
     ) -> LMState:
         """The state before the first step, which stays at y and evaluates the function there."""
         problems = jnp.zeros(f_struct.shape[1:], f_struct.dtype)
@@ -119,13 +112,7 @@ class NielsenLM(LanewiseSolver):
         )
 
     def step(
-        self,
-        fn: Any,
-        y: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: LMState,
-        tags: frozenset[object],
+        self, fn: Any, y: PyTree, args: PyTree, options: Any, state: LMState, tags: Any
     ) -> tuple[PyTree, LMState, PyTree]:
         """Try one damped step of every problem, accept it where the cost falls, adapt lambda."""
         solution = self.solved(state.normal, state.damping)
@@ -152,13 +139,7 @@ class NielsenLM(LanewiseSolver):
         return chosen(tried, y), after, normal
 
     def terminate(
-        self,
-        fn: Any,
-        y: PyTree,
-        args: PyTree,
-        options: dict[str, Any],
-        state: LMState,
-        tags: frozenset[object],
+        self, fn: Any, y: Any, args: Any, options: Any, state: LMState, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether all problems are done."""
         return jnp.all(state.done), cast(optx.RESULTS, optx.RESULTS.successful)

@@ -1,16 +1,8 @@
 """One camera: a pinhole behind a lens.
 
 Pixel (0, 0) is the centre of the top-left pixel. The camera frame is x right, y down, z
-forward. Lenses, in the conventions of OpenCV and Kalibr:
-
-    none         no distortion
-    radtan       k1 k2 p1 p2 k3          (Brown 1966; OpenCV's order)
-    rational     k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's, ROS's rational_polynomial)
-    thin_prism   those, then s1 s2 s3 s4 (OpenCV's)
-    equidistant  k1 k2 k3 k4             (Kannala and Brandt 2006; OpenCV's fisheye)
-    omni         xi k1 k2 p1 p2          (Mei and Rives 2007; Kalibr's omni-radtan)
-    double_sphere  xi alpha              (Usenko, Demmel, Cremers 2018; Kalibr's ds)
-    eucm         alpha beta              (Khomutenko, Garcia, Martinet 2016; Kalibr's eucm)
+forward. The lenses are the rows of `jaxnav.core.models.lenses.LENSES`, in the conventions of OpenCV
+(`rational` is ROS's rational_polynomial) and Kalibr.
 """
 
 from collections.abc import Sequence
@@ -99,15 +91,9 @@ class Camera(eqx.Module):
         The result is finite everywhere. Behind a camera whose lens does not see backwards it is
         a far-away pixel in the direction of the point; `in_front` tells which points can be seen.
 
-        Source: Liu, Schofield, Shan (2023), Eq. 1; lenses as in the module's docstring.
+        Source: Liu, Schofield, Shan (2023), Eq. 1; for the lenses see `lenses.py`.
         """
-        points = jnp.moveaxis(points_camera, -1, 0)
-        images = [image_of(lens, points, self.distortion)[0] for lens in self.lenses]
-        distorted = self._select([jnp.moveaxis(image, 0, -1) for image in images])
-        focal_px, center_px = (
-            on_last_axis(pair, distorted) for pair in (self.focal_px, self.center_px)
-        )
-        return distorted * focal_px + center_px
+        return self.project_with_slope(points_camera)[0]
 
     def project_with_slope(
         self, points_camera: Float[Array, "*batch 3"]

@@ -90,77 +90,38 @@ class ImuNoise(eqx.Module):
         return jnp.repeat(jnp.stack([jnp.asarray(sigma, float) for sigma in sigmas]) ** 2, 3)
 
 
-def _sensors(
-    *,
-    gyro_noise_degps: float,
-    gyro_offset_degps: float,
-    gyro_walk: float,
-    gyro_range_degps: float,
-    gyro_scale: float,
-    gyro_late_s: float,
-    accel_noise_ug: float,
-    accel_offset_mg: float,
-    accel_walk: float,
-) -> tuple[Gyro, ImuNoise]:
-    """A gyro and an IMU of one class, by figures in the units of data sheets.
+CONSUMER = ImuNoise(
+    gyroscope_noise_density=math.radians(0.014),
+    accelerometer_noise_density=175.0 * 1e-6 * _G_MPS2,  # 160 along x and y, 190 along z
+    gyroscope_random_walk=2e-5,
+    accelerometer_random_walk=3e-3,
+    gyroscope_bias_sigma=math.radians(1.0),
+    accelerometer_bias_sigma=20.0 * 1e-3 * _G_MPS2,
+)
+TACTICAL = ImuNoise(
+    gyroscope_noise_density=math.radians(0.008),
+    accelerometer_noise_density=100.0 * 1e-6 * _G_MPS2,
+    gyroscope_random_walk=4e-6,
+    accelerometer_random_walk=6e-4,
+    gyroscope_bias_sigma=math.radians(0.2),
+    accelerometer_bias_sigma=10.0 * 1e-3 * _G_MPS2,
+)
+PRESETS = {"consumer": CONSUMER, "tactical": TACTICAL}
 
-    Args:
-        gyro_noise_degps: density, deg/s/sqrt(Hz).
-        gyro_offset_degps: 1 sigma, before anything tells it.
-        gyro_walk: of the offset, rad/s/sqrt(s).
-        gyro_range_degps: a reading at it or beyond is none.
-        gyro_scale: tolerance of the sensitivity.
-        gyro_late_s: what is left of the delay.
-        accel_noise_ug: density, 1e-6 g/sqrt(Hz).
-        accel_offset_mg: 1 sigma.
-        accel_walk: m/s^2/sqrt(s).
-    """
-    noise, offset = math.radians(gyro_noise_degps), math.radians(gyro_offset_degps)
-    gyro = Gyro(
-        noise,
-        offset,
-        gyro_walk,
-        math.radians(gyro_range_degps),
-        gyro_scale,
-        delay_sigma_s=gyro_late_s,
-    )
-    return gyro, ImuNoise(
-        gyroscope_noise_density=noise,
-        accelerometer_noise_density=accel_noise_ug * 1e-6 * _G_MPS2,
-        gyroscope_random_walk=gyro_walk,
-        accelerometer_random_walk=accel_walk,
-        gyroscope_bias_sigma=offset,
-        accelerometer_bias_sigma=accel_offset_mg * 1e-3 * _G_MPS2,
+
+def _gyro(noise: ImuNoise, scale_sigma: float, delay_sigma_s: float) -> Gyro:
+    """The gyroscope of an IMU of these classes, which saturates at 2 000 deg/s, for one axis."""
+    return Gyro(
+        noise.gyroscope_noise_density,
+        noise.gyroscope_bias_sigma,
+        noise.gyroscope_random_walk,
+        math.radians(2000.0),
+        scale_sigma,
+        delay_sigma_s=delay_sigma_s,
     )
 
 
-_CLASSES = {
-    "consumer": _sensors(
-        gyro_noise_degps=0.014,
-        gyro_offset_degps=1.0,
-        gyro_walk=2e-5,
-        gyro_range_degps=2000.0,
-        gyro_scale=0.01,
-        gyro_late_s=5e-3,
-        accel_noise_ug=175.0,  # 160 along x and y, 190 along z
-        accel_offset_mg=20.0,
-        accel_walk=3e-3,
-    ),
-    "tactical": _sensors(
-        gyro_noise_degps=0.008,
-        gyro_offset_degps=0.2,
-        gyro_walk=4e-6,
-        gyro_range_degps=2000.0,
-        gyro_scale=0.003,
-        gyro_late_s=1e-3,
-        accel_noise_ug=100.0,
-        accel_offset_mg=10.0,
-        accel_walk=6e-4,
-    ),
-}
-GYROS = {name: gyro for name, (gyro, _) in _CLASSES.items()}
-PRESETS = {name: noise for name, (_, noise) in _CLASSES.items()}
-CONSUMER, TACTICAL = PRESETS["consumer"], PRESETS["tactical"]
+GYROS = {"consumer": _gyro(CONSUMER, 0.01, 5e-3), "tactical": _gyro(TACTICAL, 0.003, 1e-3)}
 
 
 class Readings(eqx.Module):
@@ -293,6 +254,9 @@ def preintegrate(
         jnp.sum(readings.dt_s),
         readings.still,
     )
+
+
+_preintegrate_all = jax.jit(jax.vmap(preintegrate, in_axes=(0, None)))
 
 
 def right_jacobian(turn: Float[Array, " 3"]) -> Float[Array, "3 3"]:
@@ -455,11 +419,6 @@ class ImuSamples:
         quiet = np.all(scatter < _STILL_SCATTER * density, axis=1)
         slow = np.all(rate < _STILL_RATE_SIGMAS * self.noise.gyroscope_bias_sigma, axis=1)
         return whole & quiet & slow
-
-
-@jax.jit
-def _preintegrate_all(readings: Readings, noise: ImuNoise) -> Preintegrated:
-    return jax.vmap(lambda rows: preintegrate(rows, noise))(readings)
 
 
 def _cut(

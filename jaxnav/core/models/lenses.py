@@ -36,7 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
-from jaxnav.core.models.geometry import on_last_axis, safe_norm
+from jaxnav.core.models.geometry import on_last_axis, safe_norm, safe_sqrt
 
 # Points nearer to the camera's plane than this multiple of their distance are projected with this
 # depth: finite and far outside of any image instead of infinite or mirrored.
@@ -63,9 +63,7 @@ def along(constant: Shaped[Array, "..."], points: Float[Array, "..."]) -> Shaped
 
 def safe_length(points: Float[Array, "n ..."]) -> Float[Array, "..."]:
     """Lengths over the first axis; 0 has the derivative 0."""
-    squared = jnp.sum(points**2, axis=0)
-    nonzero = squared > 0
-    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
+    return safe_sqrt(jnp.sum(points**2, axis=0))
 
 
 def comes_back(rays: Rays, points: Points) -> Bool[Array, "..."]:
@@ -78,9 +76,10 @@ def comes_back(rays: Rays, points: Points) -> Bool[Array, "..."]:
     return apart < float(jnp.finfo(points.dtype).eps) ** _SAME
 
 
-def towards(xy: Images) -> Rays:
-    """Unit vectors (..., 3) through images (..., 2) of a pinhole at focal length 1."""
-    ray = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+def towards(xy: Images, depth: Float[Array, "*batch"] | float = 1.0) -> Rays:
+    """Unit vectors (..., 3) along (x, y, depth); depth 1: through images of a pinhole."""
+    z = jnp.broadcast_to(jnp.asarray(depth, xy.dtype), xy.shape[:-1])
+    ray = jnp.concatenate([xy, z[..., None]], axis=-1)
     return ray / jnp.sqrt(jnp.sum(ray**2, axis=-1, keepdims=True))
 
 
@@ -335,8 +334,7 @@ def omni(points: Points, coefficients: Numbers) -> Image:
 
 
 def omni_bearing(xy: Images, coefficients: Numbers) -> Rays:
-    xy, w = _raised(unbent(xy, _brown(coefficients)), _of_omni(coefficients))
-    return _unit(xy, w)
+    return towards(*_raised(unbent(xy, _brown(coefficients)), _of_omni(coefficients)))
 
 
 def omni_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
@@ -350,7 +348,7 @@ def eucm(points: Points, coefficients: Numbers) -> Image:
 
 
 def eucm_bearing(xy: Images, coefficients: Numbers) -> Rays:
-    return _unit(*_raised(xy, _of_eucm(coefficients)))
+    return towards(*_raised(xy, _of_eucm(coefficients)))
 
 
 def eucm_sees(points: Points, coefficients: Numbers) -> Bool[Array, "..."]:
@@ -366,10 +364,7 @@ def double_sphere_bearing(xy: Images, coefficients: Numbers) -> Rays:
     xy, w = _raised(xy, _of_double_sphere(coefficients))
     r2 = jnp.sum(xy**2, axis=-1)
     # From the second sphere's middle along (x, y, w) to the first sphere, of radius 1.
-    squared = w**2 + (1 - xi**2) * r2
-    meets = squared > 0
-    root = jnp.where(meets, jnp.sqrt(jnp.where(meets, squared, 1)), 0)
-    length = (w * xi + root) / (w**2 + r2)
+    length = (w * xi + safe_sqrt(w**2 + (1 - xi**2) * r2)) / (w**2 + r2)
     return jnp.concatenate([xy * length[..., None], (w * length - xi)[..., None]], axis=-1)
 
 
@@ -412,9 +407,7 @@ def _behind(points: Array, xi: Array) -> tuple[Array, Array]:
 
 def _widened(points: Array, w: Array, beta: Array) -> Array:
     """d of points (3, ...)."""
-    squared = beta * (points[0] ** 2 + points[1] ** 2) + w**2
-    nonzero = squared > 0
-    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1)), 0)
+    return safe_sqrt(beta * (points[0] ** 2 + points[1] ** 2) + w**2)
 
 
 def _divided(points: Array, w: Array, w_slope: Array, terms: _Sum) -> Image:
@@ -453,14 +446,7 @@ def _raised(xy: Array, terms: _Sum) -> tuple[Array, Array]:
     beyond = folding * r2 > 1
     shrink = jnp.where(beyond, jnp.sqrt(1 / jnp.where(beyond, folding * r2, 1)), 1)
     xy, r2 = xy * shrink[..., None], r2 * shrink**2
-    inside = folding * r2 < 1
-    root = jnp.where(inside, jnp.sqrt(jnp.where(inside, 1 - folding * r2, 1)), 0)
-    return xy, (1 - a**2 * beta * r2) / (b + a * root)
-
-
-def _unit(xy: Array, w: Array) -> Array:
-    ray = jnp.concatenate([xy, w[..., None]], axis=-1)
-    return ray / jnp.sqrt(jnp.sum(ray**2, axis=-1, keepdims=True))
+    return xy, (1 - a**2 * beta * r2) / (b + a * safe_sqrt(1 - folding * r2))
 
 
 _INFINITE = float("inf")

@@ -192,8 +192,7 @@ def advance_twist(
 ) -> Float[Array, " 3"]:
     """(x_m, y_m, psi_rad) after dt at a constant twist in the vehicle's axes: along an arc.
 
-    The chord of an arc that turns by a has the direction of its middle and the length
-    s sin(a/2) / (a/2).
+    Its chord is that of `advance_bicycle`.
     """
     half_turn = twist[2] * dt_s / 2
     chord = matvec(planar_rotation(pose[2] + half_turn), twist) * dt_s

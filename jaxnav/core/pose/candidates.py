@@ -19,7 +19,6 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.linalg.small_matrices import in_order, where
-from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import (
     on_ground,
     rotation_matrix,
@@ -31,7 +30,7 @@ from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.pose.ippe import ippe_from_rays
 from jaxnav.core.pose.observation import Sightings, Snapshot, cameras_of
 from jaxnav.core.pose.refine import Candidates, refine_sightings
-from jaxnav.core.pose.residuals import reprojection_residuals
+from jaxnav.core.pose.residuals import in_frames, reprojection_rows
 
 # Two local minima this close are merged: 1.1 degrees, and 0.02 of the distance to the marker.
 SAME_POSE_RAD = 0.02
@@ -64,16 +63,12 @@ def find_candidates(
     if ground_plane:
         Ts_vehicle_world = jax.vmap(lambda T: on_ground(T.inverse()).inverse())(Ts_vehicle_world)
 
-    residuals = reprojection_residuals(rig, seen)
-
-    def joint_e1(T_vehicle_world: jaxlie.SE3) -> Array:
-        corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
-        return jnp.sum(residuals(corners_vehicle) ** 2)
-
     count = min(max_candidates, owner_visible.shape[0])
     if count < owner_visible.shape[0]:
-        first_guess = jnp.where(owner_visible, jax.vmap(joint_e1)(Ts_vehicle_world), jnp.inf)
-        best = in_order(-first_guess, count)
+        corners_world = markers.corners_world_m[seen.marker_index].reshape(-1, 3)
+        residual, _ = reprojection_rows(rig, seen)(in_frames(Ts_vehicle_world, corners_world))
+        joint_e1 = jnp.sum((residual * seen.sigma_px.reshape(1, -1, 1)) ** 2, axis=(0, 1))
+        best = in_order(-jnp.where(owner_visible, joint_e1, jnp.inf), count)
         Ts_vehicle_world = jaxlie.SE3(Ts_vehicle_world.wxyz_xyz[best])
         owner_visible = owner_visible[best]
 
@@ -101,7 +96,7 @@ def find_candidates(
 def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
     """RMS distance (D,), px, of each sighting's corners to the better of its own two poses.
 
-    It is large where the corners are not the image of a square.
+    It is large where the corners are not the image of a square, and 0 in hidden lanes.
 
     Args:
         snapshot: what is seen.
@@ -109,22 +104,12 @@ def own_errors_px(snapshot: Snapshot, own: jaxlie.SE3) -> Float[Array, " D"]:
     """
     rig, markers, seen = snapshot.rig, snapshot.markers, snapshot.seen
 
-    def one(
-        camera: Camera, T_camera_vehicle: jaxlie.SE3, Ts: jaxlie.SE3, corners: Array, px: Array
-    ) -> Array:
-        def error(T_vehicle_world: jaxlie.SE3) -> Array:
-            corners_camera = transform_points(T_camera_vehicle @ T_vehicle_world, corners)
-            return jnp.mean(jnp.sum((camera.project(corners_camera) - px) ** 2, axis=1))
-
-        return jnp.min(jax.vmap(error)(Ts))
-
-    squared = jax.vmap(one)(
-        *cameras_of(rig, seen),
-        own,
-        markers.corners_world_m[seen.marker_index],
-        seen.corners_px,
-    )
-    return safe_sqrt(squared)
+    corners_world = markers.corners_world_m[seen.marker_index]
+    corners_vehicle = jax.vmap(jax.vmap(transform_points, (0, None)))(own, corners_world)
+    points = corners_vehicle.transpose(3, 0, 2, 1).reshape(3, -1, 2)
+    residual, _ = reprojection_rows(rig, seen)(points)
+    error_px = residual.reshape(2, -1, 4, 2) * seen.sigma_px[None, :, :, None]
+    return safe_sqrt(jnp.min(jnp.mean(jnp.sum(error_px**2, axis=0), axis=1), axis=1))
 
 
 def both_poses(snapshot: Snapshot) -> jaxlie.SE3:
@@ -193,18 +178,6 @@ class ConsistentSnapshot(NamedTuple):
     outvoted: Bool[Array, " M"]
 
 
-class Inliers(NamedTuple):
-    """What the rejection determines of a `ConsistentSnapshot`: visibility, not the snapshot."""
-
-    visible: Bool[Array, " D"]
-    candidates: Candidates
-    outvoted: Bool[Array, " M"]
-
-    def apply_to(self, snapshot: Snapshot) -> ConsistentSnapshot:
-        """`ConsistentSnapshot` for the snapshot in which this was found."""
-        return ConsistentSnapshot(_among(snapshot, self.visible), self.candidates, self.outvoted)
-
-
 def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> ConsistentSnapshot:
     """Leave out sightings that are not squares, and a marker that the others outvote.
 
@@ -217,32 +190,34 @@ def remove_outliers(snapshot: Snapshot, find: Find, none: Candidates) -> Consist
         none: the result without a marker in view, where `find` is not called.
     """
 
-    def nothing() -> Inliers:
-        nobody = jnp.zeros(len(snapshot.markers.ids), bool)
-        return Inliers(jnp.zeros_like(snapshot.seen.visible), none, nobody)
+    nobody = jnp.zeros(len(snapshot.markers.ids), bool)
+    visible, candidates, outvoted = jax.lax.cond(
+        jnp.any(snapshot.seen.visible),
+        lambda: _consistent(snapshot, find),
+        lambda: (jnp.zeros_like(snapshot.seen.visible), none, nobody),
+    )
+    return ConsistentSnapshot(_among(snapshot, visible), candidates, outvoted)
 
-    any_seen = jnp.any(snapshot.seen.visible)
-    kept: Inliers = jax.lax.cond(any_seen, lambda: find_inliers(snapshot, find), nothing)
-    return kept.apply_to(snapshot)
 
-
-def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
-    """As `remove_outliers`, but calls `find` also where no marker is in view."""
+def _consistent(
+    snapshot: Snapshot, find: Find
+) -> tuple[Bool[Array, " D"], Candidates, Bool[Array, " M"]]:
+    """What `remove_outliers` finds where a marker is in view: visibility, not the snapshot."""
     own = both_poses(snapshot)
     snapshot = _among(snapshot, _can_be_markers(snapshot, own))
     seen, candidates = snapshot.seen, find(snapshot, own)
     nobody = jnp.zeros(len(snapshot.markers.ids), bool)
     if nobody.shape[0] < LEAST_MARKERS or seen.visible.shape[0] < LEAST_MARKERS:
-        return Inliers(seen.visible, candidates, nobody)
+        return seen.visible, candidates, nobody
     in_view = jnp.sum(_in_view(seen, nobody.shape[0]))
-    all_of_them = _excess(candidates, seen)
+    all_of_them = excess_of_best(candidates, seen)
 
     def outvote() -> tuple[Bool[Array, " D"], Candidates]:
         # One slot of each marker stands for it; slots of the same marker come to the same.
         def without(marker: Array) -> tuple[Array, Candidates]:
             rest = _among(snapshot, seen.marker_index != marker)
             alternative = find(rest, own)
-            return _excess(alternative, rest.seen), alternative
+            return excess_of_best(alternative, rest.seen), alternative
 
         excess, alternatives = jax.vmap(without)(seen.marker_index)
         excess = jnp.where(seen.visible, excess, jnp.inf)
@@ -262,7 +237,7 @@ def find_inliers(snapshot: Snapshot, find: Find) -> Inliers:
         lambda: (jnp.ones_like(seen.visible), candidates),
     )
     outvoted = _in_view(_among(snapshot, ~kept).seen, nobody.shape[0])
-    return Inliers(seen.visible & kept, candidates, outvoted)
+    return seen.visible & kept, candidates, outvoted
 
 
 def _can_be_markers(snapshot: Snapshot, own: jaxlie.SE3) -> Bool[Array, " D"]:
@@ -285,8 +260,8 @@ def _in_view(seen: Sightings, markers: int) -> Bool[Array, " M"]:
     return jnp.zeros(markers, bool).at[seen.marker_index].max(seen.visible)
 
 
-def _excess(candidates: Candidates, seen: Sightings) -> Float[Array, ""]:
-    """Cost of the best candidate over the mean plus three sigmas of its chi-square."""
+def excess_of_best(candidates: Candidates, seen: Sightings) -> Float[Array, ""]:
+    """Cost of the best candidate over its chi-square's mean plus three sigmas; inf without one."""
     misfit = candidates.least_cost
     freedom = jnp.maximum(8 * jnp.sum(seen.visible) - 6, 2).astype(misfit.dtype)
     return misfit / (freedom + 3 * jnp.sqrt(2 * freedom))

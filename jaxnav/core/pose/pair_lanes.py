@@ -328,26 +328,13 @@ class LaneLM(LanewiseSolver):
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
     def init(
-        self,
-        fn: Any,
-        y: Poses,
-        args: Marks,
-        options: dict[str, Any],
-        f_struct: PyTree,
-        aux_struct: PyTree,
-        tags: frozenset[object],
+        self, fn: Any, y: Any, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any
     ) -> _State:
         """The trace of an earlier search, with which this one continues."""
         return _State(options["trace"], options["steps"])
 
     def step(
-        self,
-        fn: Any,
-        y: Poses,
-        args: Marks,
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
+        self, fn: Any, y: Poses, args: Marks, options: Any, state: _State, tags: Any
     ) -> tuple[Poses, _State, PyTree]:
         """Try one damped step in every lane that is not done."""
         cost, damping, before, done = state.trace
@@ -376,13 +363,7 @@ class LaneLM(LanewiseSolver):
         return y, _State(trace, state.left - 1), None
 
     def terminate(
-        self,
-        fn: Any,
-        y: Poses,
-        args: Marks,
-        options: dict[str, Any],
-        state: _State,
-        tags: frozenset[object],
+        self, fn: Any, y: Any, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether all lanes are done, or no step is left."""
         over = jnp.all(state.trace.done) | (state.left <= 0)
@@ -464,13 +445,16 @@ def ippe_squares(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -
     batch = corners_n.shape[0]
     if batch == 0:
         return _empty(corners_n.dtype)
-    lanes = _block_lanes(batch, 4112, 2**18)
+    corners = _in_blocks(corners_n, _block_lanes(batch, 4112, 2**18))
+    blocks, *_, lanes = corners.shape
+    sizes = jnp.pad(size_m, (0, blocks * lanes - batch)).reshape(blocks, lanes)
 
-    def block(corners: Array, size: Array) -> PosePair:
-        seen, pair = _stacked_pair(corners)
-        return _result(pair, seen, _cost(pair, seen), size)
+    def block(both: tuple[Array, Array]) -> PosePair:
+        seen, pair = _stacked_pair(both[0])
+        return _result(pair, seen, _cost(pair, seen), both[1])
 
-    return _over_blocks(block, corners_n, size_m, lanes)
+    pairs = jax.lax.map(block, (corners, sizes))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:batch], pairs)
 
 
 def solve_pairs(corners_n: Float[Array, "B 4 2"], size_m: Float[Array, " B"]) -> PosePair:
@@ -544,15 +528,6 @@ def _finished(pose: Poses, seen: Marks, trace: SolverState) -> tuple[Poses, Solv
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1), (pose, trace))
     pose, trace, _ = jax.lax.while_loop(unfinished, one_round, (*flat, jnp.asarray(0)))
     return jax.tree.map(lambda leaf: leaf.reshape(shape), (pose, trace))
-
-
-def _over_blocks(
-    block: Callable[[Array, Array], PosePair], corners_n: Array, size_m: Array, lanes: int
-) -> PosePair:
-    corners = _in_blocks(corners_n, lanes)
-    sizes = jnp.pad(size_m, (0, corners.shape[0] * lanes - size_m.shape[0])).reshape(-1, lanes)
-    pairs = jax.lax.map(lambda both: block(*both), (corners, sizes))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: corners_n.shape[0]], pairs)
 
 
 def _empty(dtype: jnp.dtype) -> PosePair:

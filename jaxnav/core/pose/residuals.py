@@ -28,51 +28,20 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.core.linalg.small_matrices import cholesky, log_det, product, solve_positive
-from jaxnav.core.models.camera import Camera
-from jaxnav.core.models.geometry import (
-    rotation_matrix,
-    safe_norm,
-    skew,
-    transform_points,
-    turn_and_shift,
-)
+from jaxnav.core.models.geometry import rotation_matrix, safe_norm, skew, transform_points
 from jaxnav.core.models.lenses import MOST_COEFFICIENTS, image_of
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import Sightings, cameras_of, sightings
 
 
-def reprojection_residuals(
-    rig: CameraRig, seen: Sightings
-) -> Callable[[Float[Array, "M 4 3"]], Float[Array, "D 4 2"]]:
-    """Projected minus observed corners in pixels, zero in hidden lanes.
-
-    The parts that do not depend on the pose are computed here, once.
-
-    Args:
-        rig: C cameras.
-        seen: D sightings.
-
-    Returns:
-        A function of the corners of all markers of the map, in the vehicle frame, m.
-    """
-    cameras, Ts_camera_vehicle = cameras_of(rig, seen)
-    Rs_camera_vehicle = jax.vmap(rotation_matrix)(Ts_camera_vehicle.rotation())
-
-    def one(camera: Camera, R: Array, t: Array, corners: Array, corners_px: Array) -> Array:
-        return camera.project(turn_and_shift(R, t, corners)) - corners_px
-
-    def residuals(corners_vehicle: Array) -> Array:
-        pixels = jax.vmap(one)(
-            cameras,
-            Rs_camera_vehicle,
-            Ts_camera_vehicle.translation(),
-            corners_vehicle[seen.marker_index],
-            seen.corners_px,
-        )
-        return jnp.where(seen.visible[:, None, None], pixels, 0)
-
-    return residuals
+def in_frames(
+    T_frame_world: jaxlie.SE3, points_world: Float[Array, "P 3"]
+) -> Float[Array, "3 P N"]:
+    """Points of the world in each of N frames, coordinates first, m."""
+    R = jnp.moveaxis(jax.vmap(rotation_matrix)(T_frame_world.rotation()), 0, -1)
+    shift = T_frame_world.translation().T[:, None]
+    return jnp.sum(R[:, :, None] * points_world.T[None, :, :, None], axis=1) + shift
 
 
 def e1(
@@ -98,8 +67,9 @@ def e1(
     Source: Liu, Schofield, Shan (2023), Eq. 3.
     """
     seen = sightings(rig, markers, corners_px, visible)
-    corners_vehicle = transform_points(T_vehicle_world, markers.corners_world_m)
-    return jnp.sum(reprojection_residuals(rig, seen)(corners_vehicle) ** 2)
+    corners_world = markers.corners_world_m[seen.marker_index].reshape(-1, 3)
+    points = in_frames(jaxlie.SE3(T_vehicle_world.wxyz_xyz[None]), corners_world)
+    return jnp.sum(reprojection_rows(rig, seen)(points)[0] ** 2)
 
 
 def e2(

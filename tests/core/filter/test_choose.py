@@ -23,14 +23,16 @@ from jaxnav.core.filter.choose import (
     Selection,
     Selector,
     Ungated,
+    judge_branch,
+    position_error_m,
 )
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
+from tests.helpers.filters import find, select
 from tests.reference import paper
 
 BANK = MultiHypothesis(hypotheses=8)
@@ -54,12 +56,6 @@ VIEWS = {
     "frontal": FRONTAL,
     "none": worlds.NO_VIEW,
 }
-select = jax.jit(lambda selector, *arguments: selector(*arguments))
-
-
-@jax.jit
-def find(snapshot: Snapshot) -> Candidates:
-    return find_candidates(snapshot)
 
 
 @functools.partial(jax.jit, static_argnames="count")
@@ -83,18 +79,20 @@ def belief(T_world_vehicle: jaxlie.SE3, initialised: bool = True, count: int = 1
 inverses = jax.jit(jax.vmap(lambda pose: worlds.T_world_vehicle_from_planar(pose).inverse()))
 
 
-def candidates_at(poses, e1_px2, valid=None, covariance=None) -> Candidates:
-    """Candidates as given, sigma 1 px."""
-    count = len(poses)
+def candidates_at(poses, e1_px2, valid=None, covariance=None, lanes=4) -> Candidates:
+    """Candidates as given, sigma 1 px, and as many more lanes as `find` has, none of them valid."""
+    count, rest = len(poses), lanes - len(poses)
     covariance = np.broadcast_to(np.eye(6), (count, 6, 6)) if covariance is None else covariance
+    covariance = np.concatenate([covariance, np.broadcast_to(np.eye(6), (rest, 6, 6))])
+    e1_px2 = jnp.asarray(np.append(e1_px2, np.zeros(rest)), float)
     return Candidates(
-        T_vehicle_world=inverses(jnp.asarray(poses, float)),
-        e1_px2=jnp.asarray(e1_px2, float),
-        cost=jnp.asarray(e1_px2, float),
+        T_vehicle_world=inverses(jnp.asarray([*poses, *[TRUTH] * rest], float)),
+        e1_px2=e1_px2,
+        cost=e1_px2,
         covariance=jnp.asarray(covariance, float),
-        valid=jnp.ones(count, bool) if valid is None else jnp.asarray(valid),
-        converged=jnp.ones(count, bool),
-        steps=jnp.ones(count, int),
+        valid=jnp.asarray([*([True] * count if valid is None else valid), *[False] * rest]),
+        converged=jnp.ones(lanes, bool),
+        steps=jnp.ones(lanes, int),
     )
 
 
@@ -171,13 +169,10 @@ def check_selection(selection: Selection, selector: Selector, candidates: Candid
 class TestEverySelector:
     """The contract of a selector."""
 
-    def test_is_one(self, selector):
-        assert isinstance(selector, Selector)
-        assert selector.hypotheses >= 1
-
     def test_says_what_a_selection_is(self, selector, precision):
         """In every view, before and after the start, in both precisions; a batch says what its
         members say, in one."""
+        assert isinstance(selector, Selector)
         snapshots = [seen_from(pose, sigma_px=0.3) for pose in VIEWS.values()]
         found = [find(snapshot) for snapshot in snapshots]
         batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *zip(found, snapshots, strict=True))
@@ -293,12 +288,6 @@ def test_a_wide_minimum_holds_more_probability(selector):
     assert selection.flip_probability == pytest.approx(mass[1] / mass.sum(), abs=1e-12)
 
 
-def test_the_oracle_has_no_doubt():
-    candidates = candidates_at([TRUTH, TRUTH], [3.0, 3.0])
-    selection = Oracle()(belief(worlds.planar(*TRUTH)), candidates, seen_from(TRUTH))
-    assert selection.flip_probability == 0
-
-
 @pytest.mark.parametrize(
     ("errors_px", "max_ratio", "taken"),
     [((1.0, 3.1), 1 / 3, True), ((1.0, 2.9), 1 / 3, False), ((0.9, 1.0), 0.8, False),
@@ -310,7 +299,7 @@ def test_ratio_test_discards_what_is_not_clear(errors_px, max_ratio, taken):
         candidates = candidates_at([TRUTH, (1.0, -1.5, 1.0)], np.square(errors))
         prior = belief(worlds.planar(*TRUTH))
         selection = select(RatioTest(max_ratio), prior, candidates, seen_from(TRUTH))
-        np.testing.assert_allclose(selection.costs, np.square(errors))
+        np.testing.assert_allclose(selection.costs[:2], np.square(errors))
         assert bool(selection.measured.valid[0]) == taken
         assert int(selection.selected) == (int(np.argmin(errors)) if taken else -1)
         # Of a pose that is not given nothing is doubtful.
@@ -320,7 +309,7 @@ def test_ratio_test_discards_what_is_not_clear(errors_px, max_ratio, taken):
 def test_ratio_test_takes_an_only_candidate():
     prior, snapshot = belief(worlds.planar(*TRUTH)), seen_from(TRUTH)
     for candidates in (
-        candidates_at([TRUTH], [4.0]),
+        candidates_at([TRUTH], [4.0], lanes=1),
         candidates_at([TRUTH, TRUTH, TRUTH], [4.0, 4.1, 4.2], [True, False, False]),
     ):
         selection = select(RatioTest(), prior, candidates, snapshot)
@@ -336,7 +325,7 @@ def object_space_m2(candidates: Candidates, prior: jaxlie.SE3, snapshot: Snapsho
             T,
             np.asarray(prior.inverse().as_matrix()),
         )
-        for T in np.asarray(candidates.T_vehicle_world.as_matrix())
+        for T in np.asarray(candidates.T_vehicle_world.as_matrix())[np.asarray(candidates.valid)]
     ]
 
 
@@ -346,12 +335,12 @@ def test_object_space_is_equation_14_alone():
     candidates = candidates_at([(0.5, -0.2, 0.1), (0.2, 0.1, 0.6)], [0.1, 1e4])
     selection = select(ObjectSpace(), belief(prior), candidates, snapshot)
     expected = object_space_m2(candidates, prior, snapshot)
-    np.testing.assert_allclose(selection.costs, expected, rtol=1e-11)
+    np.testing.assert_allclose(selection.costs[:2], expected, rtol=1e-11)
     assert expected[1] < expected[0]
     assert int(selection.selected) == 1
     # Without a prediction there is only the image.
     first = select(ObjectSpace(), belief(prior, initialised=False), candidates, snapshot)
-    np.testing.assert_array_equal(first.costs, [0.1, 1e4])
+    np.testing.assert_array_equal(first.costs[:2], [0.1, 1e4])
     assert int(first.selected) == 0
 
 
@@ -363,7 +352,7 @@ def test_mahalanobis_is_the_whitened_error():
     covariances = roots @ np.swapaxes(roots, 1, 2)
     cost = np.array([8.0, 5.0, 2.0])
     candidates = candidates_at(poses, cost, covariance=covariances)
-    candidates = eqx.tree_at(lambda c: c.e1_px2, candidates, jnp.asarray([1.0, 2.0, 3.0]))
+    candidates = eqx.tree_at(lambda c: c.e1_px2, candidates, jnp.arange(1.0, 5.0))
     P = 0.2 * rng.normal(size=(6, 6))
     P = P @ P.T
     prior = eqx.tree_at(lambda b: b.covariance, belief(worlds.planar(*TRUTH)), jnp.asarray(P[None]))
@@ -384,7 +373,7 @@ def test_mahalanobis_is_the_whitened_error():
         )
     expected = np.array(expected)
     selection = select(Mahalanobis(), prior, candidates, seen_from(TRUTH))
-    np.testing.assert_allclose(selection.costs, expected, rtol=1e-9)
+    np.testing.assert_allclose(selection.costs[:3], expected, rtol=1e-9)
     best = int(np.argmin(expected))
     assert int(selection.selected) == best
     mass = np.exp(-(expected - expected[best]) / 2)
@@ -392,7 +381,7 @@ def test_mahalanobis_is_the_whitened_error():
     # Before the first pose: the image, and the width of its minima.
     prior = eqx.tree_at(lambda b: b.initialised, prior, jnp.asarray([False]))
     first = select(Mahalanobis(), prior, candidates, seen_from(TRUTH))
-    np.testing.assert_allclose(first.costs, cost - np.linalg.slogdet(covariances)[1], rtol=1e-9)
+    np.testing.assert_allclose(first.costs[:3], cost - np.linalg.slogdet(covariances)[1], rtol=1e-9)
 
 
 PAIR = [(1.2, -1.4, 1.0), TRUTH]  # e1 speaks for the first, the other sensors for the second
@@ -407,13 +396,13 @@ def test_orientation_given_believes_the_heading():
         snapshot = seen_from(TRUTH, heading_rad=jnp.asarray(heading), **sensed)
         selection = select(OrientationGiven(), prior, candidates, snapshot)
         gaps = np.array([TRUTH[2] + 0.05 - 1.0, 0.05]) / 0.1
-        np.testing.assert_allclose(selection.costs, [1.0, 5.0] + gaps**2, rtol=1e-9)
+        np.testing.assert_allclose(selection.costs[:2], [1.0, 5.0] + gaps**2, rtol=1e-9)
         assert int(selection.selected) == 1
         assert selection.flip_probability < 1e-6
-    for heading in (np.nan, np.inf):
-        snapshot = seen_from(TRUTH, heading_rad=jnp.asarray(heading), **sensed)
+    for heading in (jnp.asarray(np.nan), jnp.asarray(np.inf), None):
+        snapshot = seen_from(TRUTH, heading_rad=heading, **sensed)
         selection = select(OrientationGiven(), prior, candidates, snapshot)
-        np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
+        np.testing.assert_array_equal(selection.costs[:2], [1.0, 5.0])
         assert int(selection.selected) == 0
 
 
@@ -438,15 +427,8 @@ def test_orientation_given_believes_the_normals():
             for camera in {first, second} - set(broken):
                 cosine = believed[camera, 0] @ np.asarray(tilted)[camera, 0]
                 expected[index] += (np.arccos(cosine) / 0.05) ** 2
-        np.testing.assert_allclose(selection.costs, expected, rtol=1e-6)
+        np.testing.assert_allclose(selection.costs[:2], expected, rtol=1e-6)
         assert int(selection.selected) == (0 if len(broken) == 2 else 1)
-
-
-def test_orientation_given_is_the_image_s_without_a_sensor():
-    snapshot = seen_from(TRUTH, heading_rad=None, normals_camera=None)
-    candidates = candidates_at(PAIR, [1.0, 5.0])
-    selection = select(OrientationGiven(), belief(worlds.planar(*TRUTH)), candidates, snapshot)
-    np.testing.assert_array_equal(selection.costs, [1.0, 5.0])
 
 
 def test_the_oracle_picks_what_is_nearest_to_the_truth_in_angle():
@@ -454,8 +436,9 @@ def test_the_oracle_picks_what_is_nearest_to_the_truth_in_angle():
     poses = [(TRUTH[0], TRUTH[1], TRUTH[2] + 0.4), (9.0, 9.0, TRUTH[2] - 0.3), (2.0, -1.0, 1.0)]
     candidates = candidates_at(poses, [1.0, 50.0, 0.0])
     selection = Oracle()(belief(worlds.planar(*poses[2])), candidates, seen_from(TRUTH))
-    np.testing.assert_allclose(selection.costs, [0.4, 0.3, TRUTH[2] - 1.0], atol=1e-9)
+    np.testing.assert_allclose(selection.costs[:3], [0.4, 0.3, TRUTH[2] - 1.0], atol=1e-9)
     assert int(selection.selected) == 1
+    assert selection.flip_probability == 0
 
 
 def test_the_oracle_says_what_it_lacks():
@@ -472,17 +455,12 @@ def test_paper_cost_is_equations_13_and_14():
     candidates = candidates_at([(0.2, 0.1, 0.6), (0.5, -0.2, 0.1)], [4.0, 3.0])
     selection = select(PaperCost(), belief(prior), candidates, snapshot)
     metres = np.array(object_space_m2(candidates, prior, snapshot))
-    np.testing.assert_allclose(selection.costs, [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
+    np.testing.assert_allclose(selection.costs[:2], [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
     assert int(selection.selected) == 0
-
-
-def test_before_the_first_pose_e_is_e1():
-    candidates = candidates_at([TRUTH, (1.0, -1.5, 1.0)], [2.0, 1.0])
-    arguments = (candidates, seen_from(TRUTH))
-    unaware = select(PaperCost(), belief(worlds.planar(*TRUTH), initialised=False), *arguments)
-    np.testing.assert_array_equal(unaware.costs, [2.0, 1.0])
-    assert int(unaware.selected) == 1
-    assert int(select(PaperCost(), belief(worlds.planar(*TRUTH)), *arguments).selected) == 0
+    # Before the first pose e is e1.
+    first = select(PaperCost(), belief(prior, initialised=False), candidates, snapshot)
+    np.testing.assert_array_equal(first.costs[:2], [4.0, 3.0])
+    assert int(first.selected) == 1
 
 
 @pytest.fixture(scope="module")
@@ -529,3 +507,33 @@ def test_a_misled_prediction_misleads_the_paper_s_rule(ambiguous):
     _, candidates, snapshot = ambiguous
     mirror = jaxlie.SE3(candidates.T_vehicle_world.wxyz_xyz[0]).inverse()
     assert int(select(PaperCost(), belief(mirror), candidates, snapshot).selected) == 0
+
+
+@pytest.mark.parametrize(
+    ("degrees", "valid", "selected", "expected"),
+    [
+        # judged, wrong, outlier, ambiguous
+        ((1.0, 40.0), [True, True], 0, (True, False, False, True)),
+        ((1.0, 40.0), [True, True], 1, (True, True, False, True)),
+        ((40.0, 41.0), [True, True], 0, (True, False, True, True)),
+        ((40.0, 1.0), [True, False], 0, (True, False, True, False)),
+        ((3.0, 1.0), [True, False], 0, (True, False, False, False)),
+        # Equally far, but for rounding.
+        ((-7.0, 7.0), [True, True], 0, (True, False, False, True)),
+        ((-7.0, 7.0), [True, True], 1, (True, False, False, True)),
+        ((1.0, 40.0), [True, True], -1, (False, False, False, False)),
+        ((1.0, 40.0), [False, False], -1, (False, False, False, False)),
+    ],
+)
+def test_a_branch_is_wrong_when_another_candidate_is_closer_in_angle(
+    degrees, valid, selected, expected
+):
+    seen = candidates_at([(1.0, 2.0, np.deg2rad(angle)) for angle in degrees], [0.0, 1.0], valid)
+    branch = judge_branch(seen, jnp.asarray(selected), worlds.planar(1.0, 2.0, 0.0))
+    told = branch.judged, branch.wrong, branch.outlier, branch.ambiguous
+    assert tuple(map(bool, told)) == expected
+
+
+def test_a_distance_is_that_of_the_positions():
+    here, there = worlds.planar(1.0, 2.0, 0.3), worlds.planar(1.0, 4.0, -0.4)
+    assert position_error_m(here, there) == pytest.approx(2.0)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from jaxnav.core.filter.choose import MeasuredPose
@@ -24,6 +25,7 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Snapshot
 from jaxnav.core.pose.residuals import camera_slopes, reprojection_rows
 from tests import worlds
+from tests.helpers.filters import believing, predicted, reading
 
 SIGMA = np.array([0.03, 0.03, 0.01, 0.02])
 SLIP_SIGMA = 0.05
@@ -52,8 +54,7 @@ def navigator() -> Navigator:
 
 def bank_at(navigator: Navigator, rng: np.random.Generator):
     """A single hypothesis at VIEW, all of its states correlated."""
-    bank = navigator.motion.init(1)
-    n = bank.mean.shape[1]
+    n = navigator.motion.init(1).mean.shape[1]
     scale = np.concatenate(
         [[0.03, 0.03, 0.03], [0.1] * 3, [SLIP_SIGMA], SIGMA, np.ones(n - SENSORS_END)]
     )
@@ -61,16 +62,36 @@ def bank_at(navigator: Navigator, rng: np.random.Generator):
     mean[:3] = VIEW + 0.01 * rng.normal(size=3)
     mean[3:SIX] = 0.3, -0.1, 0.2
     mean[SIX:] = 0.3 * scale[SIX:] * rng.normal(size=n - SIX)
-    return eqx.tree_at(
-        lambda b: (b.mean, b.covariance, b.initialised, b.log_weight),
-        bank,
-        (
-            jnp.asarray(mean[None]),
-            jnp.asarray(spd(n, rng, scale)[None]),
-            jnp.ones(1, bool),
-            jnp.zeros(1),
-        ),
-    )
+    return believing(navigator.motion, mean, spd(n, rng, scale))
+
+
+def first(bank):
+    """Its first hypothesis, without an axis."""
+    return jax.tree.map(lambda leaf: leaf[0], bank)
+
+
+@jax.jit
+def driven(motion, bank, readings, poses, sigma):
+    """The last bank of one hypothesis, and its means, whose poses no gate looks at.
+
+    Args:
+        readings: (frames, reads, 3), speed, steering and time since the one before.
+        poses: (frames, 3), planar.
+        sigma: (3,) of the poses.
+    """
+    R = PLANAR @ jnp.diag(sigma**2) @ PLANAR.T
+
+    def read(bank, told):
+        speed_mps, steering_rad, dt_s = told
+        return motion.predict(bank, reading(speed_mps, steering_rad, dt_s=dt_s)), None
+
+    def frame(bank, told):
+        bank, _ = jax.lax.scan(read, bank, told[0])
+        seen = MeasuredPose(worlds.planar(*told[1]), R, jnp.zeros(()), jnp.asarray(True))
+        mean, P = motion.offer(first(bank), seen).posterior
+        return dataclasses.replace(bank, mean=mean[None], covariance=P[None]), mean
+
+    return jax.lax.scan(frame, bank, (readings, poses))
 
 
 def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
@@ -135,10 +156,7 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     np.testing.assert_allclose(q[seen], y[3:][seen], atol=1e-4)
 
     # The rest of the state, by the joint Gaussian of all of it.
-    posterior = jax.tree.map(lambda leaf: leaf[0], fit.posterior)
-    offer = eqx.filter_jit(navigator.motion.offer)(
-        jax.tree.map(lambda leaf: leaf[0], bank), posterior
-    )
+    offer = eqx.filter_jit(navigator.motion.offer)(first(bank), first(fit.posterior))
     mean, covariance = map(np.asarray, offer.posterior)
     np.testing.assert_allclose(mean[SENSORS_END:] - bank.mean[0, SENSORS_END:], y[3:], atol=1e-4)
     np.testing.assert_allclose(covariance[SENSORS_END:, SENSORS_END:], C[3:, 3:], atol=2e-3)
@@ -175,40 +193,38 @@ def moved(T_world_vehicle: jaxlie.SE3, corners):
     return jax.vmap(T_world_vehicle.inverse().apply)(corners).T[..., None]
 
 
-@pytest.mark.parametrize("hidden", [False, True])
-def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(hidden):
+@pytest.mark.parametrize("seen", ["none", "all", "one hidden"])
+@pytest.mark.parametrize("freedom", [PLANAR, jnp.eye(6)], ids=["car", "free"])
+def test_the_rest_follows_pose_and_errors_as_a_gaussian_does(freedom, seen):
     """The textbook's joint update by a measurement of pose and errors, of which some are unseen."""
-    rng = np.random.default_rng(7)
-    n, d, e = 12, 3, 4
+    rng, d, e = np.random.default_rng(7), freedom.shape[1], 4
+    n, k = 2 * d + 6, 0 if seen == "none" else 2
     P = spd(n, rng, np.full(n, 0.01))
-    rows = np.eye(e)[:2]
-    if hidden:
-        rows = np.vstack([rows, np.zeros((1, e))])
-    H = np.zeros((d + 2, n))
+    H = np.zeros((d + k, n))
     H[:d, :d] = np.eye(d)
-    H[d:, n - e :] = np.eye(e)[:2]
-    R = spd(d + 2, rng, np.full(d + 2, 0.01))
-    z = 0.003 * rng.normal(size=d + 2)
+    H[d:, n - e :] = np.eye(e)[:k]
+    R = spd(d + k, rng, np.full(d + k, 0.01))
+    z = 0.003 * rng.normal(size=d + k)
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     expected, P_expected = K @ z, P - K @ H @ P
     y, C = H @ expected, H @ P_expected @ H.T
-    slope = C[d:, :d] @ np.linalg.inv(C[:d, :d])
+    rows, slope = np.eye(e)[:k], C[d:, :d] @ np.linalg.inv(C[:d, :d])
     given = C[d:, d:] - slope @ C[:d, d:]
-    if hidden:
+    if seen == "one hidden":
         y, slope = np.append(y, 0), np.vstack([slope, np.zeros((1, d))])
-        given = np.block([[given, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+        given, rows = block_diag(given, 1), np.vstack([rows, np.zeros((1, e))])
     T_prior = worlds.planar(0.3, -0.2, 0.7)
-    xi = PLANAR @ jnp.asarray(y[:d])
+    errors = ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows)))
     corrected = MeasuredPose(
-        T_prior @ cayley(xi),
-        PLANAR @ jnp.asarray(C[:d, :d]) @ PLANAR.T,
+        T_prior @ cayley(freedom @ jnp.asarray(y[:d])),
+        freedom @ jnp.asarray(C[:d, :d]) @ freedom.T,
         jnp.zeros(()),
         jnp.asarray(True),
         jnp.zeros(d),
         jnp.ones(()),
-        ErrorsPosterior(*map(jnp.asarray, (y[d:], slope, given, rows))),
+        errors if k else None,
     )
-    correction, after = follow(jnp.asarray(P), T_prior, corrected, PLANAR, n - e)
+    correction, after = follow(jnp.asarray(P), T_prior, corrected, freedom, n - e)
     np.testing.assert_allclose(correction[:d], y[:d], atol=1e-8)
     np.testing.assert_allclose(correction, expected, atol=2e-5)
     np.testing.assert_allclose(after, P_expected, atol=3e-6)
@@ -263,20 +279,12 @@ def test_nothing_is_learnt_while_the_heading_is_open_or_from_odometry(navigator)
     motion = navigator.motion
     bank = motion.init(2)
     P = bank.covariance.at[:, 2, 2].set(0.01**2)
-    bank = eqx.tree_at(
-        lambda b: (b.covariance, b.initialised, b.log_weight),
-        bank,
-        (P, jnp.ones(2, bool), jnp.log(jnp.asarray([0.9, 0.1]))),
-    )
+    bank = believing(motion, bank.mean, P, [0.9, 0.1])
     assert bool(motion.learns(bank))
     mirrored = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[1, 2].set(1.0))
     assert not bool(motion.learns(mirrored))
-    obs = worlds.observe(off_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
-    obs = dataclasses.replace(
-        obs, speed_mps=jnp.asarray(0.5), steering_rad=jnp.asarray(0.3), dt_s=jnp.asarray(0.1)
-    )
-    predict = eqx.filter_jit(motion.predict)
-    later = predict(predict(bank, obs), obs)
+    obs = reading(0.5, 0.3)
+    later = predicted(motion, predicted(motion, bank, obs), obs)
     np.testing.assert_array_equal(later.mean[:, SIX:], 0)
     errors = bank.covariance[:, SIX:, SIX:]
     np.testing.assert_allclose(later.covariance[:, SIX:, SIX:], errors, rtol=1e-12)
@@ -286,14 +294,10 @@ def test_a_slip_fades_with_the_way_and_another_comes(navigator):
     """A Gauss-Markov process: the covariance of two slips falls with the way between them."""
     motion, rng = navigator.motion, np.random.default_rng(3)
     bank = bank_at(navigator, rng)
-    obs = worlds.observe(off_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
-    obs = dataclasses.replace(
-        obs, dt_s=jnp.asarray(0.1), has_odometry=jnp.asarray(False), speed_mps=jnp.zeros(())
-    )
+    obs = reading(has_odometry=False)
     way_m = 0.1 * float(jnp.linalg.norm(bank.mean[0, 3:5]))
     f = np.exp(-way_m / motion.slip_length_m)
-    predict = eqx.filter_jit(motion.predict)
-    later = predict(bank, obs)
+    later = predicted(motion, bank, obs)
     n = bank.mean.shape[1]
     F = np.eye(n)
     F[SLIP, SLIP] = f
@@ -304,7 +308,7 @@ def test_a_slip_fades_with_the_way_and_another_comes(navigator):
     assert float(later.mean[0, SLIP]) == pytest.approx(f * float(bank.mean[0, SLIP]))
     still = motion.init(1)  # at its prior it stays there, whatever the way
     moving = eqx.tree_at(lambda b: b.mean, still, still.mean.at[:, 3].set(0.5))
-    variance = predict(moving, obs).covariance[0, SLIP, SLIP]
+    variance = predicted(motion, moving, obs).covariance[0, SLIP, SLIP]
     assert float(variance) == pytest.approx(SLIP_SIGMA**2)
 
 
@@ -314,30 +318,13 @@ def test_the_pose_follows_where_wheels_spin(slip_sigma):
     the slip is known and the pose has followed; without one the constant scale takes it along."""
     car = dataclasses.replace(off_car(), sensor_sigma=jnp.asarray([0.03, 0.0, 0.0, 0.0]))
     motion = BicycleKalman(car, slip_sigma=slip_sigma)
-    bank = eqx.tree_at(lambda b: b.initialised, motion.init(1), jnp.ones(1, bool))
-    P = bank.covariance.at[:, :SIX, :SIX].multiply(0.01**2)
-    bank = eqx.tree_at(lambda b: b.covariance, bank, P)
-    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
-    sigma_m = 0.01
-    R = PLANAR @ (sigma_m**2 * jnp.eye(3)) @ PLANAR.T
-
-    def frame(bank, time_s):
-        read = 0.3 * jnp.where(time_s < 4, 1, 1.25)
-        told = dataclasses.replace(
-            obs, speed_mps=read, steering_rad=jnp.zeros(()), dt_s=jnp.asarray(1 / 15)
-        )
-        bank = motion.predict(bank, told)
-        there = MeasuredPose(
-            worlds.planar(0.3 * time_s, 0.0, 0.0), R, jnp.zeros(()), jnp.asarray(True)
-        )
-        offer = motion.offer(jax.tree.map(lambda leaf: leaf[0], bank), there)
-        bank = eqx.tree_at(
-            lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
-        )
-        return bank, bank.mean[0]
-
-    times_s = jnp.arange(1, 91) / 15
-    mean = np.asarray(jax.jit(lambda: jax.lax.scan(frame, bank, times_s)[1])())
+    start = motion.init(1)
+    bank = believing(motion, start.mean, start.covariance.at[:, :SIX, :SIX].multiply(0.01**2))
+    times_s = np.arange(1, 91) / 15
+    told = np.tile([0.3, 0, 1 / 15], (90, 1, 1))
+    told[times_s >= 4, :, 0] *= 1.25
+    poses = np.outer(0.3 * times_s, [1, 0, 0])
+    mean = np.asarray(driven(motion, bank, told, poses, np.full(3, 0.01))[1])
     slip, scale = mean[:, SLIP], mean[:, SLIP + 1]
     behind_m = abs(mean[-1, 0] - 0.3 * times_s[-1])
     assert max(abs(slip[times_s < 4]).max(), abs(scale[times_s < 4]).max()) < 0.015
@@ -395,15 +382,10 @@ def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
     """
     cars, period, reads = 16, 1 / 15, odometry_hz // 15
     motion = BicycleKalman(off_car())
-    obs = worlds.observe(worlds.qcar_rig(), worlds.paper_markers(), worlds.planar(*VIEW))
     sigma = np.array([0.004, 0.004, 0.004])
-    R = PLANAR @ jnp.diag(jnp.asarray(sigma**2)) @ PLANAR.T
     start = motion.init(1)
     P = start.covariance.at[:, :3, :3].multiply(0.03**2).at[:, 3:SIX, 3:SIX].multiply(0.01**2)
-    mean = start.mean.at[0, 3].set(0.35)
-    start = eqx.tree_at(
-        lambda b: (b.initialised, b.mean, b.covariance), start, (jnp.ones(1, bool), mean, P)
-    )
+    start = believing(motion, start.mean.at[0, 3].set(0.35), P)
     rng, frames = np.random.default_rng(8), 450
     poses, readings = [], []
     for _ in range(cars):
@@ -412,30 +394,12 @@ def test_the_delay_of_corners_is_learnt_as_well_as_it_claims(
         seen = pose[np.round(at_ms - 1e3 * delay_s).astype(int)] - [*pose[250, :2], 0]
         poses.append(seen + sigma * rng.normal(size=(frames, 3)))
         ends = at_ms[:, None] - 1e3 * period * np.arange(reads)[::-1] / reads
-        readings.append(steering[np.round(ends).astype(int)])
+        angles = steering[np.round(ends).astype(int)]
+        speed, dt_s = np.full(angles.shape, 0.35), np.full(angles.shape, period / reads)
+        readings.append(np.stack([speed, angles, dt_s], axis=-1))
 
-    def frame(bank, told):
-        pose, steering = told
-
-        def read(bank, angle):
-            event = dataclasses.replace(
-                obs,
-                speed_mps=jnp.asarray(0.35),
-                steering_rad=angle,
-                dt_s=jnp.asarray(period / reads),
-            )
-            return motion.predict(bank, event), None
-
-        bank, _ = jax.lax.scan(read, bank, steering)
-        there = MeasuredPose(worlds.planar(*pose), R, jnp.zeros(()), jnp.asarray(True))
-        offer = motion.offer(jax.tree.map(lambda leaf: leaf[0], bank), there)
-        bank = eqx.tree_at(
-            lambda b: (b.mean, b.covariance), bank, tuple(leaf[None] for leaf in offer.posterior)
-        )
-        return bank, None
-
-    drive = jax.jit(jax.vmap(lambda told: jax.lax.scan(frame, start, told)[0]))
-    bank = drive((jnp.asarray(np.array(poses)), jnp.asarray(np.array(readings))))
+    drive = jax.vmap(driven, (None, None, 0, 0, None))
+    bank, _ = drive(motion, start, np.array(readings), np.array(poses), sigma)
     tau = np.asarray(bank.mean[:, 0, SENSORS_END - 1])
     sigma_s = np.sqrt(np.asarray(bank.covariance[:, 0, SENSORS_END - 1, SENSORS_END - 1]))
     assert np.all(sigma_s < 0.01)
@@ -451,7 +415,7 @@ def test_a_body_that_moves_freely_learns_how_cameras_differ_and_not_how_they_tur
     bank, n = navigator.motion.init(1), 12 + 4 * EACH
     T = T_world_vehicle_from_planar(jnp.asarray(VIEW))
     before = dataclasses.replace(
-        jax.tree.map(lambda leaf: leaf[0], bank),
+        first(bank),
         mean=jnp.zeros(n + 1).at[:7].set(T.wxyz_xyz),
         covariance=jnp.asarray(spd(n, rng, np.append(np.full(12, 0.05), np.ones(12)))),
         initialised=jnp.asarray(True),
@@ -509,13 +473,3 @@ def test_the_turn_of_cameras_alike_counts_in_radians_and_those_in_view(unseen):
     kept, wider = schmidt_update_along(jnp.zeros((6, EACH)), 4 * P, correction, P)
     np.testing.assert_array_equal(kept, correction)
     np.testing.assert_array_equal(wider, P)
-
-
-def test_a_rule_has_the_paper_s_six_states():
-    from jaxnav.core.filter.choose import PaperCost
-
-    rule = Navigator(off_rig(), worlds.paper_markers(), off_car(), selector=PaperCost())
-    assert rule.init().belief.bank.mean.shape == (1, 6)
-    exact = Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
-    assert exact.init().belief.bank.mean.shape == (24, 6)
-    assert isinstance(exact.motion, BicycleKalman)

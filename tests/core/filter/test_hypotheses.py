@@ -1,5 +1,6 @@
 """The bank of hypotheses: its start, its fits and weights, its mergers and its decisions."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -12,21 +13,20 @@ import scipy.linalg
 import scipy.optimize
 import scipy.stats
 
-from jaxnav.core.filter.bank import Bank, PoseBelief, empty_bank, merge_hypotheses
-from jaxnav.core.filter.choose import MeasuredPose, Selection
+from jaxnav.core.filter.bank import PoseBelief, merge_hypotheses
+from jaxnav.core.filter.choose import Selection
 from jaxnav.core.filter.fit import fit_poses
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis, fan, nearer_to_another
-from jaxnav.core.filter.motion import follow_pose
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.geometry import on_ground
 from jaxnav.core.navigator import Navigator
-from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
 from tests.helpers.compiling import jit_to_run
+from tests.helpers.filters import believing, find, select
 from tests.reference import kalman, paper
 from tests.reference.rigid import cayley, inverse_cayley
 
@@ -45,12 +45,6 @@ EXACT = MultiHypothesis(
     gate=1e9,
     forget_log_weight=-1e9,
 )
-select = jax.jit(lambda selector, *arguments: selector(*arguments))
-
-
-@jax.jit
-def find(snapshot: Snapshot) -> Candidates:
-    return find_candidates(snapshot)
 
 
 @functools.cache
@@ -166,28 +160,29 @@ def correlations(covariance, freedom) -> np.ndarray:
     return P / (sigma[:, :, None] * sigma[:, None])
 
 
-@pytest.mark.parametrize("freedom", [PLANAR, EYE])
-@pytest.mark.parametrize("floor", [0.0, 1e-4])
-def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom, floor):
+@jit_to_run
+def covariances_of(here, prior, snapshot, floors):
+    fits = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
+    return fits.posterior.covariance
+
+
+@pytest.mark.parametrize("freedom", [PLANAR, EYE], ids=["car", "free"])
+def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom):
     """A drive's first frames: nothing known to a metre, corners known to a fiftieth of a pixel."""
     snapshot, prior = view(NEAR, 0.02), priors(NEAR, freedom, scale=20.0)
     here = jnp.tile(worlds.planar(*NEAR).wxyz_xyz, (8, 1))
-    floors = jnp.full(6, floor)
-
-    def covariance(here, prior, snapshot, floors):
-        found = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
-        return found.posterior.covariance
-
-    exact = correlations(jit_to_run(covariance)(here, prior, snapshot, floors), freedom)
     narrow = {np.float64: np.float32, np.int64: np.int32}
-    with jax.enable_x64(False):
-        rounded = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, narrow.get(leaf.dtype.type, leaf.dtype)),
-            jax.tree.map(np.asarray, (here, prior, snapshot, floors)),
-        )
-        found = correlations(jit_to_run(covariance)(*rounded), freedom)
-    np.testing.assert_allclose(found, exact, atol=0.01)
-    assert np.all(np.linalg.eigvalsh(found) > 0)
+    for floor in (0.0, 1e-4):
+        told = here, prior, snapshot, jnp.full(6, floor)
+        exact = correlations(covariances_of(*told), freedom)
+        with jax.enable_x64(False):
+            rounded = jax.tree.map(
+                lambda leaf: jnp.asarray(leaf, narrow.get(leaf.dtype.type, leaf.dtype)),
+                jax.tree.map(np.asarray, told),
+            )
+            found = correlations(covariances_of(*rounded), freedom)
+        np.testing.assert_allclose(found, exact, atol=0.01)
+        assert np.all(np.linalg.eigvalsh(found) > 0)
 
 
 @pytest.mark.parametrize("most", [1.0, 1.5, 1e9])
@@ -364,19 +359,11 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     alive = np.array([True, True, True, True, False, True])
     weights = np.where(alive, rng.uniform(0.1, 1, count), 0.7)
     merged_into = np.array([0, 0, 2, 0, 2, 2])
-    belief = Bank(
-        jnp.asarray(means), jnp.asarray(covariances), jnp.log(weights), jnp.asarray(alive),
-        empty_bank(jnp.zeros(n), jnp.eye(n), 3, count).rejections, jnp.arange(count),
-        jnp.zeros((count, 3)), jnp.arange(count),
-    )  # fmt: skip
+    motion = BicycleKalman(worlds.qcar())
+    belief = believing(motion, means, covariances, weights)
+    belief = dataclasses.replace(belief, initialised=jnp.asarray(alive))
 
-    def difference(mean, base):
-        apart = mean - base
-        return apart.at[2].set(jnp.arctan2(jnp.sin(apart[2]), jnp.cos(apart[2])))
-
-    after = merge_hypotheses(
-        belief, jnp.asarray(merged_into), difference, lambda mean, error: mean + error
-    )
+    after = merge_hypotheses(belief, jnp.asarray(merged_into), motion.difference, motion.moved)
     assert after.initialised.tolist() == [True, False, True, False, False, False]
     for receiver in (0, 2):
         who = np.flatnonzero((merged_into == receiver) & alive)
@@ -392,6 +379,9 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
         np.testing.assert_allclose(error, 0, atol=1e-12)
         np.testing.assert_allclose(after.covariance[receiver], covariance, atol=1e-12)
         assert np.exp(after.log_weight[receiver]) == pytest.approx(weights[who].sum())
+    alone = merge_hypotheses(belief, jnp.arange(count), motion.difference, motion.moved)
+    for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(belief), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-15)
 
 
 @pytest.mark.parametrize(("kind", "size"), [("car", 6), ("free", 12)])
@@ -406,16 +396,8 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
     means = jax.vmap(motion.moved)(seam, jnp.asarray(shifts))
     roots = 0.02 * rng.normal(size=(4, size, size)) + 0.03 * np.eye(size)
     share = np.array([0.5, 0.3, 0.2, 0.9])
-    belief = eqx.tree_at(
-        lambda b: (b.mean, b.covariance, b.log_weight, b.initialised),
-        start,
-        (
-            means,
-            jnp.asarray(roots @ np.swapaxes(roots, 1, 2)),
-            jnp.log(share),
-            jnp.asarray([True, True, True, False]),
-        ),
-    )
+    belief = believing(motion, means, roots @ np.swapaxes(roots, 1, 2), share)
+    belief = dataclasses.replace(belief, initialised=jnp.arange(4) < 3)
     drawn = rng.choice(3, size=20_000, p=share[:3])
     errors = np.einsum("sde,se->sd", roots[drawn], rng.normal(size=(len(drawn), size)))
     truths = jax.vmap(motion.moved)(means[drawn], jnp.asarray(errors))
@@ -430,40 +412,6 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
         np.testing.assert_array_equal(
             motion.error_covariance(nobody, jnp.asarray(0)), nobody.covariance[0]
         )
-
-
-def test_nobody_merges_with_itself():
-    motionless = Bank(
-        jnp.ones((3, 2)), jnp.tile(jnp.eye(2), (3, 1, 1)), jnp.log(jnp.asarray([0.2, 0.3, 0.5])),
-        jnp.asarray([True, False, True]), empty_bank(jnp.zeros(2), jnp.eye(2), 1, 3).rejections,
-        jnp.arange(3), jnp.zeros((3, 1)), jnp.arange(3),
-    )  # fmt: skip
-    after = merge_hypotheses(motionless, jnp.arange(3), lambda m, b: m - b, lambda m, e: m + e)
-    for one, other in zip(jax.tree.leaves(after), jax.tree.leaves(motionless), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-15)
-
-
-@pytest.mark.parametrize(("n", "freedom"), [(6, PLANAR), (12, EYE)])
-def test_the_rest_of_the_state_follows_as_a_gaussian_does(n, freedom):
-    """A measured pose, taken by the textbook's joint update, and by the pose first and then
-    `follow_pose`."""
-    rng = np.random.default_rng(3)
-    d = freedom.shape[1]
-    root = 0.1 * rng.normal(size=(n, n))
-    P, R = root @ root.T, 0.05**2 * np.diag(rng.uniform(0.5, 2, d))
-    H = np.eye(d, n)
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
-    innovation = 1e-6 * rng.normal(size=d)
-    expected, P_expected = K @ innovation, (np.eye(n) - K @ H) @ P
-    T_prior = worlds.planar(0.3, -0.2, 2.0)
-    T = T_prior @ jaxlie.SE3.exp(jnp.asarray(freedom @ expected[:d]))
-    covariance = jnp.asarray(freedom @ P_expected[:d, :d] @ freedom.T)
-    nis = jnp.zeros(d)
-    corrected = MeasuredPose(T, covariance, jnp.zeros(()), jnp.asarray(True), nis, jnp.ones(()))
-    correction, after = follow_pose(jnp.asarray(P), T_prior, corrected, jnp.asarray(freedom), n)
-    np.testing.assert_allclose(correction, expected, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(after, P_expected, atol=1e-6 * np.max(P_expected))
-    assert np.all(np.linalg.eigvalsh(np.asarray(after)) > 0)
 
 
 # Drives: 15 Hz, corner noise 1 px, the odometer's noise that of the simulations.
@@ -588,15 +536,9 @@ def test_a_parked_car_whose_image_says_nothing_stays_undecided():
     assert np.mean(seen.flip_probability) > 0.1
 
 
-@pytest.fixture(scope="module")
-def across() -> tuple[Observation, Seen]:
-    obs = sensed(SIDEWAYS, 0.4)
-    return obs, run(car(), obs)
-
-
-def test_a_short_drive_across_decides_for_the_truth(across):
+def test_a_short_drive_across_decides_for_the_truth():
     """Two metres, of which the mirror image would have seen another side of the marker."""
-    _, seen = across
+    seen = run(car(), sensed(SIDEWAYS, 0.4))
     position_m, heading_rad = errors_of(seen, SIDEWAYS)
     assert not np.any(seen.decided[:, 0])
     assert np.all(seen.decided[:, -1])
@@ -615,7 +557,7 @@ def test_a_short_drive_across_decides_for_the_truth(across):
     assert not np.any(jumped & sure[:, :-1])
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_wheels_that_slip_choose_no_branch(seed):
     """They turn a car a tenth less than they say, so that all branches are contradicted alike."""
     poses = arc((2.0, -1.0, np.deg2rad(125.0)), 0.5, -0.4)
@@ -655,20 +597,6 @@ def test_one_gross_outlier_changes_nothing():
         assert np.max(gaps_rad) < np.deg2rad(0.5)
 
 
-def test_what_the_gate_keeps_out_changes_no_verdict_either(across):
-    """An outlier long after the decision, far from the marker, where its poses lie close."""
-    frame = 60
-    obs, clean = across
-    assert np.all(clean.decided[:, frame - 1])
-    moved = obs.corners_px.at[:, frame].add(jnp.asarray([60.0, -25.0]).reshape(1, 1, 1, 1, 2))
-    spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, moved))
-    assert np.all(spoilt.rejections[:, frame] == 1)
-    assert np.all(spoilt.decided[:, frame:])
-    before = np.asarray(clean.flip_probability[:, frame - 1])
-    assert np.all(np.asarray(spoilt.flip_probability[:, frame]) < before + 1e-6)
-    np.testing.assert_array_equal(spoilt.hypotheses[:, frame], clean.hypotheses[:, frame - 1])
-
-
 def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
     """One hypothesis alone, and nothing in view: what its heading's sigma says."""
     far_deg = 20.0
@@ -691,21 +619,19 @@ def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
         assert bool(selection.decided) == (sigma_deg < 12)
 
 
-def test_a_bank_without_room_for_a_fan_is_refused():
-    with pytest.raises(ValueError, match="at least 5"):
-        MultiHypothesis(hypotheses=4)
-
-
 @pytest.mark.parametrize(
-    ("evidence", "mass"), [(-12.0, 3e-5), (float(np.log(3e-5)), 3e-5), (-5.0, 0.01)]
+    ("options", "told"),
+    [
+        ({"hypotheses": 4}, "at least 5"),
+        ({"outlier_log_evidence": -12.0}, "a single frame would decide.*decided_mass, 3e-05"),
+        ({"outlier_log_evidence": float(np.log(3e-5))}, "a single frame would decide"),
+        ({"outlier_log_evidence": -5.0, "decided_mass": 0.01}, "decided_mass, 0.01"),
+    ],
 )
-def test_a_bank_in_which_one_frame_would_decide_is_refused(evidence, mass):
-    with pytest.raises(ValueError, match="a single frame would decide") as caught:
-        MultiHypothesis(outlier_log_evidence=evidence, decided_mass=mass)
-    assert f"decided_mass, {mass:.2g}" in str(caught.value)
-
-
-def test_a_bank_that_never_decides_or_needs_two_frames_is_made():
+def test_a_bank_without_room_for_a_fan_or_in_which_one_frame_decides_is_refused(options, told):
+    with pytest.raises(ValueError, match=told):
+        MultiHypothesis(**options)
+    # One that never decides, or needs two frames, is made.
     MultiHypothesis(outlier_log_evidence=-1e9, decided_mass=0.0)
     MultiHypothesis(outlier_log_evidence=float(np.log(3e-5)) + 1e-6, decided_mass=3e-5)
 

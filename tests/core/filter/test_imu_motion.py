@@ -20,7 +20,9 @@ from jaxnav.core.models.imu import (
 )
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
+from tests.core.models.test_imu import gtsam_of, need_gtsam
 from tests.derivatives import in_float32
+from tests.helpers.filters import believing, predicted
 
 NOISE = ImuNoise(2e-3, 3e-2, 4e-3, 5e-2, 0.05, 0.2)
 ARM_M = np.array([0.2, -0.1, 0.3])
@@ -31,15 +33,6 @@ def at(dt_s=0.1, imu=None) -> Observation:
     """An observation without corners."""
     nothing = jnp.zeros((1, 1, 4, 2)), jnp.zeros((1, 1), bool)
     return Observation(*nothing, dt_s=jnp.asarray(dt_s, float), imu=imu)
-
-
-def started(motion, mean, P):
-    """One hypothesis."""
-    return eqx.tree_at(
-        lambda b: (b.mean, b.covariance, b.initialised),
-        motion.init(),
-        (jnp.asarray(mean, float)[None], jnp.asarray(P, float)[None], jnp.ones(1, bool)),
-    )
 
 
 def random_state(seed=0, size=0.01):
@@ -60,9 +53,6 @@ def measured(seed=0, count=40, dt_s=0.005, still=False, noise=NOISE) -> Preinteg
     return eqx.filter_jit(preintegrate)(Readings(*rows, jnp.asarray(still)), noise)
 
 
-predict = jax.jit(lambda motion, bank, obs: motion.predict(bank, obs))
-
-
 @pytest.mark.parametrize("reading", ["none", "empty", "nan", "of another interval"])
 def test_without_a_reading_it_is_the_constant_velocity_s(reading):
     """And the biases walk."""
@@ -72,9 +62,9 @@ def test_without_a_reading_it_is_the_constant_velocity_s(reading):
         imu = dataclasses.replace(measured(), velocity_mps=jnp.full(3, jnp.nan))
     elif reading == "of another interval":
         imu = measured(count=30)
-    ours = predict(InertialMotion(NOISE), started(InertialMotion(NOISE), mean, P), at(0.2, imu))
+    ours = predicted(InertialMotion(NOISE), believing(InertialMotion(NOISE), mean, P), at(0.2, imu))
     plain = ConstantVelocity()
-    theirs = predict(plain, started(plain, mean[:13], P[:12, :12]), at(0.2))
+    theirs = predicted(plain, believing(plain, mean[:13], P[:12, :12]), at(0.2))
     np.testing.assert_allclose(ours.mean[0, :13], theirs.mean[0], atol=1e-12)
     np.testing.assert_allclose(ours.covariance[0, :12, :12], theirs.covariance[0], atol=1e-12)
     np.testing.assert_array_equal(ours.mean[0, 13:], mean[13:])
@@ -87,7 +77,7 @@ def test_with_a_lever_arm_it_is_the_vehicle_that_goes_straight():
     mean, P = random_state(size=0.0)
     motion = InertialMotion(NOISE, lever_arm_m=jnp.asarray(ARM_M))
     mean[7:10] = TWIST[:3] + np.cross(TWIST[3:], ARM_M)
-    after = predict(motion, started(motion, mean, P), at(0.3))
+    after = predicted(motion, believing(motion, mean, P), at(0.3))
     T = jaxlie.SE3(jnp.asarray(mean[:7])) @ jaxlie.SE3.exp(jnp.asarray(TWIST * 0.3))
     np.testing.assert_allclose(after.mean[0, :7], T.wxyz_xyz, atol=1e-12)
     np.testing.assert_allclose(after.mean[0, 7:13], mean[7:13], atol=1e-12)
@@ -111,7 +101,7 @@ def test_the_prediction_is_the_textbook_s_in_the_world():
     mean, P = random_state(3)
     motion = InertialMotion(NOISE, lever_arm_m=jnp.asarray(ARM_M))
     imu = measured()
-    after = predict(motion, started(motion, mean, P), at(0.2, imu))
+    after = predicted(motion, believing(motion, mean, P), at(0.2, imu))
     T = np.asarray(jaxlie.SE3(jnp.asarray(mean[:7])).as_matrix())
     R, p, v = textbook(T, T[:3, :3] @ mean[7:10], mean[13:19], mean[19:], imu, ARM_M)
     T_after = np.asarray(jaxlie.SE3(after.mean[0, :7]).as_matrix())
@@ -130,24 +120,16 @@ def test_gtsam_s_combined_factor_has_the_same_mean_and_covariance_of_the_predict
     covariance of the other sign than its own residuals (see `test_preintegration`).
     """
     noise = dataclasses.replace(NOISE, gyroscope_random_walk=1e-6, accelerometer_random_walk=1e-6)
-    gtsam = pytest.importorskip("gtsam", reason="gtsam, the oracle, has no wheel here")
+    gtsam = need_gtsam()
     mean, _ = random_state(5)
     mean[19:] = [0, 0, -9.81]
     gyro = np.tile([0.4, -1.0, 0.7], (200, 1))
     accel = np.random.default_rng(1).normal([1.0, -2.0, 9.0], 1, (200, 3))
     dt_s = 0.001
     gyro_bias, accel_bias = mean[13:16], mean[16:19]
-    params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
-    params.setBiasAccCovariance(np.eye(3) * noise.accelerometer_random_walk**2)
-    params.setBiasOmegaCovariance(np.eye(3) * noise.gyroscope_random_walk**2)
-    params.setBiasAccOmegaInit(np.zeros((6, 6)))
-    params.setGyroscopeCovariance(np.eye(3) * noise.gyroscope_noise_density**2)
-    params.setAccelerometerCovariance(np.eye(3) * noise.accelerometer_noise_density**2)
-    params.setIntegrationCovariance(np.zeros((3, 3)))
-    bias = gtsam.imuBias.ConstantBias(accel_bias, gyro_bias)
-    theirs = gtsam.PreintegratedCombinedMeasurements(params, bias)
-    for w, a in zip(gyro, accel, strict=True):
-        theirs.integrateMeasurement(a, w, dt_s)
+    biases = accel_bias, gyro_bias
+    theirs = gtsam_of(gtsam, gyro, accel, dt_s, noise, biases, combined=True)
+    bias = gtsam.imuBias.ConstantBias(*biases)
 
     T = np.asarray(jaxlie.SE3(jnp.asarray(mean[:7])).as_matrix())
     R, v_world = T[:3, :3], T[:3, :3] @ mean[7:10]
@@ -199,7 +181,7 @@ def test_gtsam_s_combined_factor_has_the_same_mean_and_covariance_of_the_predict
     readings = Readings(*rows, jnp.asarray(False))
     imu = preintegrate(readings, noise, jnp.asarray(gyro_bias), jnp.asarray(accel_bias))
     motion = InertialMotion(noise)
-    after = predict(motion, started(motion, mean, P), at(0.2, imu))
+    after = predicted(motion, believing(motion, mean, P), at(0.2, imu))
 
     T_after = np.asarray(jaxlie.SE3(after.mean[0, :7]).as_matrix())
     np.testing.assert_allclose(T_after, state.pose().matrix(), atol=1e-9)
@@ -220,7 +202,7 @@ def test_a_filter_that_carries_samples_has_their_covariance():
     mean, P = random_state(8, size=0.005)
     motion = InertialMotion(NOISE, lever_arm_m=jnp.asarray(ARM_M))
     imu = measured(2)
-    after = predict(motion, started(motion, mean, P), at(0.2, imu))
+    after = predicted(motion, believing(motion, mean, P), at(0.2, imu))
     rng = np.random.default_rng(0)
     errors = jnp.asarray(rng.normal(size=(20_000, 21)) @ np.linalg.cholesky(P).T)
     off = rng.normal(size=(20_000, 15)) @ np.linalg.cholesky(imu.covariance + 1e-16 * np.eye(15)).T
@@ -263,9 +245,9 @@ def test_a_body_at_rest_tells_the_gyroscope_s_bias_and_the_lean_of_the_map():
     mean = np.concatenate([[1, 0, 0, 0, 0, 0, 0], first[0]])
     P = np.zeros((21, 21))
     P[6:, 6:], P[:6, :6] = first[1], 1e-6 * np.eye(6)
-    bank = started(motion, mean, P)
+    bank = believing(motion, mean, P)
     for _ in range(100):
-        bank = predict(motion, bank, at(0.1, imu))
+        bank = predicted(motion, bank, at(0.1, imu))
     found, P = np.asarray(bank.mean[0]), np.asarray(bank.covariance[0])
     np.testing.assert_allclose(found[7:13], 0, atol=0.01)
     np.testing.assert_allclose(found[13:16], bias, atol=0.003)
@@ -276,7 +258,7 @@ def test_a_body_at_rest_tells_the_gyroscope_s_bias_and_the_lean_of_the_map():
     assert abs(found[19]) > 0.1
     # In flight nothing of it is done.
     moving = dataclasses.replace(imu, still=jnp.asarray(False))
-    free = predict(motion, started(motion, mean, P), at(0.1, moving))
+    free = predicted(motion, believing(motion, mean, P), at(0.1, moving))
     np.testing.assert_array_equal(free.mean[0, 13:], mean[13:])
 
 
@@ -289,25 +271,20 @@ def test_rest_weighs_the_hypotheses_by_how_well_they_rest():
     P[6:9, 6:9] = 1e-4 * np.eye(3)
     side = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     means = np.stack([np.concatenate([q, np.zeros(3), first[0]]) for q in (side, [1, 0, 0, 0.0])])
-    bank = eqx.tree_at(
-        lambda b: (b.mean, b.covariance, b.initialised, b.log_weight),
-        motion.init(2),
-        (jnp.asarray(means), jnp.asarray(np.stack([P] * 2)), jnp.ones(2, bool),
-         jnp.log(jnp.asarray([0.5, 0.5]))),
-    )  # fmt: skip
+    bank = believing(motion, means, P)
     rows = jnp.zeros((20, 3)), jnp.tile(jnp.asarray([0, 0, 9.81]), (20, 1)), jnp.full(20, 0.01)
     imu = preintegrate(Readings(*rows, jnp.zeros(20, bool), jnp.asarray(True)), NOISE)
-    weights = np.exp(np.asarray(predict(motion, bank, at(0.2, imu)).log_weight))
+    weights = np.exp(np.asarray(predicted(motion, bank, at(0.2, imu)).log_weight))
     assert weights.sum() == pytest.approx(1)
     assert weights[0] < 0.01
     anywhere = InertialMotion.in_any_world(NOISE)
     wide = eqx.tree_at(
         lambda b: b.covariance, bank, bank.covariance.at[:, 18:, 18:].set(100 * jnp.eye(3))
     )
-    weights = np.exp(np.asarray(predict(anywhere, wide, at(0.2, imu)).log_weight))
+    weights = np.exp(np.asarray(predicted(anywhere, wide, at(0.2, imu)).log_weight))
     assert 0.2 < weights[0] < 0.6
     fast = eqx.tree_at(lambda b: b.mean, bank, bank.mean.at[:, 7].set(1.0))
-    after = predict(motion, fast, at(0.2, imu))
+    after = predicted(motion, fast, at(0.2, imu))
     assert after.mean[1, 7] == pytest.approx(1.0, abs=1e-6)
     np.testing.assert_allclose(after.log_weight, bank.log_weight)
 
@@ -323,7 +300,7 @@ def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
         motion, mean, gyro, accel, dt_s = floats
         rows = gyro, accel, dt_s
         imu = preintegrate(Readings(*rows, jnp.zeros(4, bool), still), motion.noise)
-        bank = started(motion, jnp.eye(22)[0], 1e-4 * jnp.eye(21))
+        bank = believing(motion, jnp.eye(22)[0], 1e-4 * jnp.eye(21))
         bank = eqx.tree_at(lambda b: b.mean, bank, bank.mean + mean[None])
         obs = at(jnp.sum(dt_s), imu)
         bank = motion.predict(motion.predict(bank, obs), obs)
@@ -348,10 +325,10 @@ def test_the_cameras_errors_stay_and_keep_what_they_have_to_do_with_the_pose():
     root = 0.1 * rng.normal(size=(33, 33))
     whole = root @ root.T
     whole[:21, :21] += P
-    alone = predict(InertialMotion(NOISE), started(InertialMotion(NOISE), mean, whole[:21, :21]),
-                    at(0.2, measured()))  # fmt: skip
-    bank = started(motion, np.append(mean, np.arange(12.0)), whole)
-    after = predict(motion, bank, at(0.2, measured()))
+    plain = InertialMotion(NOISE)
+    alone = predicted(plain, believing(plain, mean, whole[:21, :21]), at(0.2, measured()))
+    bank = believing(motion, np.append(mean, np.arange(12.0)), whole)
+    after = predicted(motion, bank, at(0.2, measured()))
     np.testing.assert_allclose(after.mean[0, :22], alone.mean[0], atol=1e-12)
     np.testing.assert_array_equal(after.mean[0, 22:], np.arange(12.0))
     found = np.asarray(after.covariance[0])

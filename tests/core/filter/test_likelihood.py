@@ -23,6 +23,7 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation, Snapshot, log_sigmas
 from jaxnav.experiments.tuning.filter import trust_corners
 from tests import worlds
+from tests.helpers import filters
 from tests.reference import kalman as textbook
 
 RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
@@ -39,14 +40,7 @@ def navigator(selector, ground_plane=False, tilt_sigma_rad=TINY, height_sigma_m=
     )
 
 
-def believing(mean, covariance) -> Bank:
-    """One hypothesis that has started."""
-    empty = BicycleKalman(CAR).init(1)
-    return eqx.tree_at(
-        lambda b: (b.mean, b.covariance, b.initialised),
-        empty,
-        (jnp.asarray(mean)[None], jnp.asarray(covariance)[None], jnp.ones(1, bool)),
-    )
+believing = functools.partial(filters.believing, BicycleKalman(CAR))
 
 
 def at_rest(pose, P) -> Bank:
@@ -300,17 +294,14 @@ def test_uneven_noise_is_the_world_s_at_that_heading(psi_rad):
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     mean = np.array([0.3, -0.2, psi_rad, 0.2, -0.1, 0.3])
     P, dt_s = 1e-2 * ROOT @ ROOT.T, 0.1
-    obs = Observation(
-        jnp.zeros((4, 1, 4, 2)), jnp.zeros((4, 1), bool), jnp.asarray(0.3), jnp.asarray(0.2),
-        jnp.asarray(dt_s), has_odometry=jnp.asarray(True),
-    )  # fmt: skip
+    obs = filters.reading(0.3, 0.2, dt_s=dt_s)
     even = {
         "acceleration_density": jnp.asarray([0.2, 0.2, 0.7]),
         "odometry_sigma": jnp.full(3, 0.1),
     }
     for noise in (UNEVEN, even):
         motion = BicycleKalman(CAR, **noise)
-        after = predict(motion, believing(mean, P), obs)
+        after = filters.predicted(motion, believing(mean, P), obs)
         D, odometry = (
             np.asarray(noise[name]) for name in ("acceleration_density", "odometry_sigma")
         )
@@ -334,8 +325,3 @@ def test_uneven_noise_is_the_world_s_at_that_heading(psi_rad):
         expected = turn.T @ np.append(x_own[:2], [0, *x_own[3:]])
         np.testing.assert_allclose(np.delete(after.mean[0], 2), np.delete(expected, 2), atol=1e-9)
         np.testing.assert_allclose(textbook.wrap(after.mean[0, 2] - x_own[2] - x[2]), 0, atol=1e-9)
-
-
-@jax.jit
-def predict(motion, belief, obs):
-    return motion.predict(belief, obs)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from jaxnav.core.filter import odometry
-from jaxnav.core.filter.choose import MeasuredPose, Selection
 from jaxnav.core.filter.odometry import (
     SENSORS_END,
     SIX,
@@ -24,6 +23,8 @@ from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase, velocity_
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives
+from tests.helpers import filters
+from tests.helpers.filters import believing, level, predicted, stepped
 
 NOISE, BIAS_SIGMA = 1e-3, 0.02
 GYRO = Gyro(NOISE, BIAS_SIGMA, bias_walk=0.0, saturation_radps=30.0)
@@ -37,32 +38,16 @@ def base(gyro=None, sensor_sigma=None) -> TwistBase:
 
 def reading(twist=(0.0, 0.0, 0.0), gyro_radps=np.nan, dt_s=DT_S, **car) -> Observation:
     x, y, turn = twist
-    return Observation(
-        jnp.zeros((1, 1, 4, 2)),
-        jnp.zeros((1, 1), bool),
-        dt_s=jnp.asarray(dt_s, float),
-        twist=jnp.asarray([x, y, 0.0, 0.0, 0.0, turn], float),
-        gyro_radps=jnp.asarray([0.0, 0.0, gyro_radps], float),
-        **{name: jnp.asarray(value) for name, value in car.items()},
-    )
-
-
-@jax.jit
-def predicted(motion, bank, obs):
-    return motion.predict(bank, obs)
+    told = {"twist": [x, y, 0, 0, 0, turn], "gyro_radps": [0, 0, gyro_radps]}
+    return filters.reading(dt_s=dt_s, **told, **car)
 
 
 def begun(motion: BicycleKalman, *poses, sigma=0.02):
     """Hypotheses of the same weight at these poses, whose velocity says nothing of the heading."""
-    bank, count = motion.init(len(poses)), len(poses)
-    mean = bank.mean.at[:, :3].set(jnp.asarray(poses, float))
-    variance = jnp.asarray([sigma**2] * 3 + [1.0] * 3)
-    P = bank.covariance.at[:, :SIX, :SIX].set(jnp.diag(variance))
-    return eqx.tree_at(
-        lambda b: (b.mean, b.covariance, b.initialised, b.log_weight),
-        bank,
-        (mean, P, jnp.ones(count, bool), jnp.full(count, -np.log(count))),
-    )
+    bank = motion.init(len(poses))
+    P = jnp.diag(jnp.asarray([sigma**2] * 3 + [1.0] * 3))
+    P = bank.covariance.at[:, :SIX, :SIX].set(P)
+    return believing(motion, bank.mean.at[:, :3].set(jnp.asarray(poses, float)), P)
 
 
 def test_a_twist_is_corrected_as_umbmark_says():
@@ -286,28 +271,10 @@ def test_poses_teach_the_bias_only_once_the_heading_is_known(apart_rad):
     """Poses that turn by 0.05 rad/s less than a gyro of 0.05 rad/s says."""
     motion = BicycleKalman(base(dataclasses.replace(GYRO), DEFAULT_TWIST_SIGMA))
     bank = begun(motion, [0.0, 0.0, 0.3], [0.0, 0.0, 0.3 + apart_rad], sigma=0.01)
-    seen = jnp.asarray([0.0, 0.0, 0.3])
-
-    @jax.jit
-    def step(bank, obs):
-        prior = motion.predict(bank, obs)
-        both = worlds.T_world_vehicle_from_planar(jnp.stack([seen, seen.at[2].add(apart_rad)]))
-        covariance = jnp.tile(0.003**2 * jnp.eye(6), (2, 1, 1))
-        measured = MeasuredPose(both, covariance, jnp.zeros(2), jnp.ones(2, bool))
-        selection = Selection(
-            measured=measured,
-            kept=prior.initialised,
-            log_weight=prior.log_weight,
-            merged_into=jnp.arange(2),
-            costs=jnp.zeros(2),
-            selected=jnp.asarray(0),
-            flip_probability=jnp.asarray(0.5),
-            decided=jnp.asarray(False),
-        )
-        return motion.update(prior, selection, obs).bank
-
+    seen = np.stack([level(psi_rad=0.3), level(psi_rad=0.3 + apart_rad)])
+    told = reading((np.nan, np.nan, np.nan), 0.05), seen, 0.003**2 * np.eye(6)
     for _ in range(40):
-        bank = step(bank, reading((np.nan, np.nan, np.nan), 0.05))
+        _, bank, _ = stepped(motion, bank, *told)
     bias, sigma = bank.mean[:, -1], np.sqrt(bank.covariance[:, -1, -1])
     if apart_rad:
         np.testing.assert_array_equal(bias, 0)
@@ -332,8 +299,7 @@ def test_gradients_are_finite_where_it_stands():
         obs = eqx.tree_at(lambda o: (o.twist, o.gyro_radps), reading(), (twist, z))
         return motion.predict(bank, obs).mean[0]
 
+    slopes_of = jax.jit(jax.jacrev(heading, argnums=(0, 1)))
     for z in (0.0, np.nan):
-        slopes = jax.jit(jax.jacrev(heading, argnums=(0, 1)))(
-            jnp.zeros(6), jnp.asarray([0.0, 0.0, z])
-        )
+        slopes = slopes_of(jnp.zeros(6), jnp.asarray([0.0, 0.0, z]))
         assert all(np.all(np.isfinite(slope)) for slope in slopes)

@@ -31,6 +31,10 @@ def snapshot(shift_px=0.0, visible=True) -> Snapshot:
     return shoot(rig, markers, worlds.observe(rig, markers, pose()), shift_px, visible)
 
 
+def with_corners(shot: Snapshot, corners_px) -> Snapshot:
+    return dataclasses.replace(shot, seen=dataclasses.replace(shot.seen, corners_px=corners_px))
+
+
 @jax.jit
 def shoot(rig, markers, obs, shift_px, visible) -> Snapshot:
     obs = dataclasses.replace(
@@ -82,10 +86,8 @@ def test_what_has_moved_counts_anew():
 def test_what_surprises_counts_anew():
     """By n / surprise^2: at four times the bound a repeated sighting is new but for a sixteenth."""
     _, repeats = weigh(nothing(), snapshot())
-    one, four = (
-        jax.jit(MODEL.weighed)(repeats, snapshot(), surprise).seen.sigma_px[0, 0]
-        for surprise in (1.0, 4.0)
-    )
+    weighed = jax.jit(MODEL.weighed)
+    one, four = (weighed(repeats, snapshot(), by).seen.sigma_px[0, 0] for by in (1.0, 4.0))
     n = 1 / 16
     growth = (1 - SHARE + (n + 1) * SHARE) * (1 - SHARE + n * SHARE) / (1 - SHARE)
     assert float(four) == pytest.approx(SIGMA_PX * np.sqrt(growth))
@@ -159,9 +161,10 @@ def test_a_pause_changes_nothing():
 
 def test_white_errors_are_told_by_a_share_of_nothing():
     repeats, white = nothing(), RepeatedErrors(0.0, 0.0)
+    weighed, after = jax.jit(white.weighed), jax.jit(white.after)
     for _ in range(5):
-        seen = jax.jit(white.weighed)(repeats, snapshot()).seen
-        repeats = jax.jit(white.after)(repeats, snapshot(), pose(), YES)
+        seen = weighed(repeats, snapshot()).seen
+        repeats = after(repeats, snapshot(), pose(), YES)
         np.testing.assert_allclose(seen.sigma_px, snapshot().seen.sigma_px, rtol=1e-12)
 
 
@@ -220,7 +223,7 @@ def test_what_no_pose_explains_is_what_least_squares_leave():
     rng = np.random.default_rng(3)
     seen = shot.seen
     noisy = seen.corners_px + rng.normal(size=seen.corners_px.shape)
-    shot = dataclasses.replace(shot, seen=dataclasses.replace(seen, corners_px=noisy))
+    shot = with_corners(shot, noisy)
     T = pose().inverse()
     got = np.asarray(jax.jit(unexplained)(T, shot))
     for i in np.flatnonzero(np.asarray(seen.visible)):
@@ -252,8 +255,7 @@ def test_a_spoilt_frame_teaches_nothing():
         wrong_px = 15.0 if n in (20, 21) else 0.0
         shot = snapshot()
         bent = shot.seen.corners_px.at[:, 0].add(wrong_px)
-        shot = dataclasses.replace(shot, seen=dataclasses.replace(shot.seen, corners_px=bent))
-        repeats = judged(repeats, shot)
+        repeats = judged(repeats, with_corners(shot, bent))
     assert float(repeats.share) <= 0
 
 
@@ -270,8 +272,7 @@ def test_a_pose_that_looks_away_leaves_nothing_behind():
     for n in range(200):
         shot = snapshot()
         noisy = shot.seen.corners_px + SIGMA_PX * rng.normal(size=shot.seen.corners_px.shape)
-        shot = dataclasses.replace(shot, seen=dataclasses.replace(shot.seen, corners_px=noisy))
-        repeats = judged(repeats, shot, away if 20 <= n < 30 else pose())
+        repeats = judged(repeats, with_corners(shot, noisy), away if 20 <= n < 30 else pose())
     assert float(repeats.share) < 0.02
     assert np.abs(repeats.unexplained).max() < 30
 

@@ -1,4 +1,4 @@
-"""Smoothing against a dense least squares, against its own covariance, and along a bank's slots."""
+"""Smoothing against a dense least squares, and along a bank's slots; drives in `test_free.py`."""
 
 import dataclasses
 
@@ -16,6 +16,7 @@ from jaxnav.core.filter.smooth import Trail, doubt, smoothed
 from jaxnav.core.models.geometry import cayley, inverse_cayley
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
+from tests.helpers.filters import believing, level, predicted
 
 STEPS = 12
 DT_S = 0.1
@@ -57,7 +58,6 @@ def filter_and_smooth(motion, first, measured):
 
 
 run = jax.jit(filter_and_smooth)
-run_many = jax.jit(jax.vmap(filter_and_smooth, in_axes=(None, 0, 0)))
 
 
 def test_small_motions_are_smoothed_as_by_one_least_squares_over_all_of_them():
@@ -108,26 +108,20 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
     )
     z = small * rng.normal(size=(STEPS, 3))
 
-    def correct(moments, measured):
-        mean, P = moments
+    @jax.jit
+    def correct(mean, P, measured):
         innovation = measured - mean[:3]
         correction, P, _ = kalman.update(P, innovation, jnp.asarray(H), jnp.asarray(R))
         return motion.moved(mean, correction), P
 
-    @jax.jit
-    def both_ways(z):
-        measured = nominal[:, :3] + z
-        filtered = [correct((nominal[0], P), measured[0])]
-        for pose in measured[1:]:
-            mean, before = filtered[-1]
-            bank = motion.init(1)
-            bank = dataclasses.replace(bank, mean=mean[None], covariance=before[None])
-            bank = motion.predict(bank, obs)
-            filtered.append(correct((bank.mean[0], bank.covariance[0]), pose))
-        trail = filtered[-1:]
-        for moments in filtered[-2::-1]:
-            trail.insert(0, smoothed(motion, moments, trail[0], obs))
-        return trail
+    measured = np.asarray(nominal[:, :3]) + z
+    filtered = [correct(nominal[0], P, measured[0])]
+    for pose in measured[1:]:
+        bank = predicted(motion, believing(motion, *filtered[-1]), obs)
+        filtered.append(correct(bank.mean[0], bank.covariance[0], pose))
+    trail, back = filtered[-1:], jax.jit(smoothed)
+    for moments in filtered[-2::-1]:
+        trail.insert(0, back(motion, moments, trail[0], obs))
 
     A = np.eye(6) + DT_S * np.eye(6, k=3)
     Q = np.asarray(kalman.white_acceleration(motion.acceleration_density, DT_S))
@@ -148,61 +142,18 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
             information[at, at] += wheels.T @ of_wheels @ wheels
     covariance = np.linalg.inv(information)
     expected = (covariance @ right).reshape(STEPS, 6)
-    for step, (mean, found) in enumerate(both_ways(jnp.asarray(z))):
+    for step, (mean, found) in enumerate(trail):
         block = covariance[6 * step : 6 * step + 6, 6 * step : 6 * step + 6]
         np.testing.assert_allclose(mean - nominal[step], expected[step], atol=1e-4 * small)
         np.testing.assert_allclose(found, block, atol=1e-5 * block.max())
 
 
-def simulated(motion, key):
-    """A first mean (13,), poses (STEPS, 7) and twists (STEPS, 6) of a body, measured poses."""
-    keys = jax.random.split(key, 3)
-    still = jnp.zeros(13).at[0].set(1)
-    first = motion.moved(still, jax.random.normal(keys[0], (12,)) * jnp.sqrt(jnp.diag(P_FIRST)))
-    Q = kalman.white_acceleration(motion.acceleration_density, DT_S)
-    root = jnp.linalg.cholesky(Q)
-
-    def go(mean, key):
-        later = motion.evolve(mean, P_FIRST, after(DT_S))[0]
-        later = motion.moved(later, root @ jax.random.normal(key, (12,)))
-        return later, later
-
-    _, rest = jax.lax.scan(go, first, jax.random.split(keys[1], STEPS - 1))
-    truth = jnp.concatenate([first[None], rest])
-    noise = SIGMA[None] * jax.random.normal(keys[2], (STEPS, 6))
-    poses = jax.vmap(lambda one, xi: (jaxlie.SE3(one[:7]) @ cayley(xi)).wxyz_xyz)(truth, noise)
-    return still, truth, poses
-
-
-def test_errors_are_as_large_as_their_covariance_says_and_smaller_than_the_filters():
-    motion, drives = ConstantVelocity(), 200
-    still, truth, poses = jax.jit(jax.vmap(lambda key: simulated(motion, key)))(
-        jax.random.split(jax.random.key(5), drives)
-    )
-    first = still, jnp.broadcast_to(P_FIRST, (drives, 12, 12))
-    errors, nees = [], []
-    for mean, P in run_many(motion, first, poses):
-        error = jax.vmap(jax.vmap(motion.difference))(truth, mean)
-        errors.append(np.asarray(error))
-        whitened = np.linalg.solve(np.linalg.cholesky(P), errors[-1][..., None])[..., 0]
-        nees.append(np.mean(np.sum(whitened**2, axis=-1), axis=0) / 12)
-    filtered, both = (np.sqrt(np.mean(error**2, axis=0)) for error in errors)
-    # 200 drives of 12 degrees of freedom: a sigma of 3 %.
-    assert np.all(np.abs(nees[1] - 1) < 0.12), nees[1]
-    np.testing.assert_allclose(both[-1], filtered[-1], rtol=1e-12)  # the last one knows as much
-    middle = slice(2, STEPS - 2)
-    assert np.all(both[middle].mean(axis=0) < 0.95 * filtered[middle].mean(axis=0))
-
-
 def bank_of(motion, turns_rad, log_weight, initialised, parent):
     """Four hypotheses at the origin that look in different directions."""
-    bank = motion.init(4)
-    wxyz_xyz = [
-        jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(float(a))).wxyz_xyz for a in turns_rad
-    ]
+    bank, turns = motion.init(4), np.stack([level(psi_rad=turn) for turn in turns_rad])
     return dataclasses.replace(
         bank,
-        mean=bank.mean.at[:, :7].set(jnp.stack(wxyz_xyz)),
+        mean=bank.mean.at[:, :7].set(turns),
         covariance=bank.covariance * 1e-4,
         log_weight=jnp.asarray(log_weight, float),
         initialised=jnp.asarray(initialised),

@@ -114,20 +114,26 @@ def test_bias_jacobians_and_covariance_are_those_of_differences():
                                atol=2e-6)  # fmt: skip
 
 
-def gtsam_of(gtsam, gyro, accel, dt_s, combined=False):
-    """GTSAM's preintegration of the readings, without noise of the integration."""
+def gtsam_of(gtsam, gyro, accel, dt_s, noise=NOISE, biases=(0.0, 0.0), combined=False):
+    """GTSAM's preintegration of the readings, without noise of the integration.
+
+    Args:
+        biases: of accelerometer and gyroscope, with which it is preintegrated.
+        combined: whether the biases walk.
+    """
     if combined:
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
-        params.setBiasAccCovariance(np.eye(3) * NOISE.accelerometer_random_walk**2)
-        params.setBiasOmegaCovariance(np.eye(3) * NOISE.gyroscope_random_walk**2)
+        params.setBiasAccCovariance(np.eye(3) * noise.accelerometer_random_walk**2)
+        params.setBiasOmegaCovariance(np.eye(3) * noise.gyroscope_random_walk**2)
         params.setBiasAccOmegaInit(np.zeros((6, 6)))
     else:
         params = gtsam.PreintegrationParams.MakeSharedU(9.81)
-    params.setGyroscopeCovariance(np.eye(3) * NOISE.gyroscope_noise_density**2)
-    params.setAccelerometerCovariance(np.eye(3) * NOISE.accelerometer_noise_density**2)
+    params.setGyroscopeCovariance(np.eye(3) * noise.gyroscope_noise_density**2)
+    params.setAccelerometerCovariance(np.eye(3) * noise.accelerometer_noise_density**2)
     params.setIntegrationCovariance(np.zeros((3, 3)))
     kind = "PreintegratedCombinedMeasurements" if combined else "PreintegratedImuMeasurements"
-    measured = getattr(gtsam, kind)(params, gtsam.imuBias.ConstantBias())
+    bias = gtsam.imuBias.ConstantBias(*(np.broadcast_to(b, 3) for b in biases))
+    measured = getattr(gtsam, kind)(params, bias)
     for w, a in zip(gyro, accel, strict=True):
         measured.integrateMeasurement(a, w, dt_s)
     return measured

@@ -48,61 +48,36 @@ def moved(rig: CameraRig, errors: np.ndarray) -> CameraRig:
 # --- the elimination ------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def groups() -> tuple[Nuisance, np.ndarray]:
-    """Two groups of two unknowns in ten residuals, three lanes; and J_t, (lanes, m, t g)."""
+def test_what_is_left_is_the_dense_quadratic_form():
+    """r' (I + J_t J_t')^-1 r of three lanes, two groups of two unknowns in ten residuals: the same
+    of derivatives, its gradient, the most probable error, and what is left of the prior."""
     rng = np.random.default_rng(0)
     slopes = rng.normal(size=(2, 10, 2, 3))
     slopes[:, 6:, 0] = 0
     slopes[:, :6, 1] = 0
-    return Nuisance.from_slopes(jnp.asarray(slopes)), slopes.transpose(3, 1, 0, 2).reshape(3, 10, 4)
-
-
-def test_what_is_left_is_the_dense_quadratic_form(groups):
-    """r' (I + J_t J_t')^-1 r, and the same of derivatives."""
-    nuisance, dense = groups
-    rng = np.random.default_rng(1)
+    nuisance = Nuisance.from_slopes(jnp.asarray(slopes))
     r, J = rng.normal(size=(10, 3)), rng.normal(size=(6, 10, 3))
-    left_r = np.asarray(nuisance.eliminated(jnp.asarray(r)))
+    left_r, best = (np.asarray(f(jnp.asarray(r))) for f in (nuisance.eliminated, nuisance.at_best))
     left_J = np.asarray(nuisance.eliminated(jnp.asarray(J)))
+    by_r = jax.grad(lambda r: jnp.sum(nuisance.eliminated(r) ** 2))(jnp.asarray(r))
     assert left_r.shape == (14, 3)
-    for lane, J_t in enumerate(dense):
-        weight = np.linalg.inv(np.eye(10) + J_t @ J_t.T)
-        r_k, J_k = r[:, lane], J[:, :, lane].T
+    assert best.shape == (2, 2, 3)
+    for lane, J_t in enumerate(slopes.transpose(3, 1, 0, 2).reshape(3, 10, 4)):
+        S, r_k, J_k = np.eye(10) + J_t @ J_t.T, r[:, lane], J[:, :, lane].T
+        weight = np.linalg.inv(S)
         assert np.sum(left_r[:, lane] ** 2) == pytest.approx(r_k @ weight @ r_k, rel=1e-12)
         gram = left_J[:, :, lane] @ left_J[:, :, lane].T
         np.testing.assert_allclose(gram, J_k.T @ weight @ J_k, rtol=1e-10)
-        np.testing.assert_allclose(
-            left_J[:, :, lane] @ left_r[:, lane], J_k.T @ weight @ r_k, rtol=1e-10
-        )
+        gradient = J_k.T @ weight @ r_k
+        np.testing.assert_allclose(left_J[:, :, lane] @ left_r[:, lane], gradient, rtol=1e-10)
         # The moved residuals alone give the gradient too: the rest is zero at the best error.
-        np.testing.assert_allclose(J_k.T @ left_r[:10, lane], J_k.T @ weight @ r_k, rtol=1e-10)
-
-
-def test_the_most_probable_error_is_that_of_least_squares(groups):
-    nuisance, dense = groups
-    r = np.random.default_rng(2).normal(size=(10, 3))
-    best = np.asarray(nuisance.at_best(jnp.asarray(r)))
-    assert best.shape == (2, 2, 3)
-    for lane, J_t in enumerate(dense):
-        stacked = np.vstack([J_t, np.eye(4)])
-        expected = np.linalg.lstsq(stacked, np.append(-r[:, lane], np.zeros(4)), rcond=None)[0]
+        np.testing.assert_allclose(J_k.T @ left_r[:10, lane], gradient, rtol=1e-10)
+        np.testing.assert_allclose(by_r[:, lane], 2 * weight @ r_k, rtol=1e-10)
+        right = np.append(-r_k, np.zeros(4))
+        expected = np.linalg.lstsq(np.vstack([J_t, np.eye(4)]), right, rcond=None)[0]
         np.testing.assert_allclose(best[:, :, lane].ravel(), expected, rtol=1e-10)
-
-
-def test_the_share_of_the_prior_is_a_determinant(groups):
-    nuisance, dense = groups
-    shares = [-np.linalg.slogdet(np.eye(10) + J_t @ J_t.T)[1] / 2 for J_t in dense]
-    np.testing.assert_allclose(nuisance.log_share, shares, rtol=1e-12)
-
-
-def test_the_form_s_gradient_is_the_dense_one(groups):
-    nuisance, dense = groups
-    r = np.random.default_rng(3).normal(size=(10, 3))
-    by_r = jax.grad(lambda r: jnp.sum(nuisance.eliminated(r) ** 2))(jnp.asarray(r))
-    for lane, J_t in enumerate(dense):
-        weight = np.linalg.inv(np.eye(10) + J_t @ J_t.T)
-        np.testing.assert_allclose(by_r[:, lane], 2 * weight @ r[:, lane], rtol=1e-10)
+        share = -np.linalg.slogdet(S)[1] / 2
+        assert nuisance.log_share[lane] == pytest.approx(share, rel=1e-12)
 
 
 # --- the cameras' errors --------------------------------------------------------------

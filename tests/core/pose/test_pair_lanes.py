@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 import pytest
 
 from jaxnav.core.models.markers import CORNER_SIGNS
@@ -184,16 +183,3 @@ def test_gradients_are_those_of_one_marker_and_differences():
     for mine, general_one in zip(ours, theirs, strict=True):
         apart = np.abs(mine - general_one).reshape(BATCH, -1)
         assert np.max(apart[fair] / scale[fair, None]) < 1e-5
-
-
-def test_the_driver_is_optimistix(monkeypatch):
-    solvers = []
-    original = optimistix.least_squares
-
-    def spy(fn, solver, *args, **kwargs):
-        solvers.append(type(solver))
-        return original(fn, solver, *args, **kwargs)
-
-    monkeypatch.setattr(optimistix, "least_squares", spy)
-    jax.eval_shape(pair_lanes.solve_pairs, jnp.zeros((4, 4, 2)), jnp.ones(4))
-    assert set(solvers) == {pair_lanes.LaneLM}

@@ -14,6 +14,7 @@ from jaxnav.core.linalg.levenberg_marquardt import KEEP_FOUND
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.observation import Observation
+from jaxnav.core.pose.pair_lanes import solve_pairs
 from jaxnav.core.pose.refine import refine_pose, solve_marker, solve_markers
 from jaxnav.core.pose.residuals import e1
 from tests import worlds
@@ -76,7 +77,8 @@ def test_levenberg_marquardt_is_optimistix(monkeypatch):
         lambda c: refine_pose(rig, markers, c, obs.visible, worlds.planar(0.0, 0.0, 1.5)),
         obs.corners_px,
     )
-    assert len(solvers) == 2
+    jax.eval_shape(solve_pairs, jnp.zeros((4, 4, 2)), jnp.ones(4))
+    assert len(solvers) >= 3
     assert all(issubclass(solver, optimistix.AbstractLeastSquaresSolver) for solver in solvers)
 
 
@@ -226,6 +228,7 @@ def test_sigma_weighs_corners(room):
     np.testing.assert_allclose(half, one / 4, rtol=1e-2)
 
 
+@pytest.mark.long  # test_nuisance.py has them of cameras that are off
 def test_implicit_gradients_are_differences(room):
     rig, markers, obs, T_world_vehicle = room
     noise = 0.3 * np.random.default_rng(6).standard_normal(obs.corners_px.shape)
