@@ -25,8 +25,8 @@ hypothesis.settings.load_profile("shared")
 # As a terminal has it: a suite under `nohup` would have tests whose programs ignore it too.
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # The workers share the programs that they compile, and the next run finds them, in a fresh clone as
-# well: what a program is called by is its text, the compiler and its flags. The thousands that are a single operation are
-# kept too.
+# well: what a program is called by is its text, the compiler and its flags. The thousands that are
+# a single operation are kept too.
 home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 kept = os.environ.get("JAXNAV_TEST_CACHE") or home / "jaxnav-tests"
 jax.config.update("jax_compilation_cache_dir", str(kept))

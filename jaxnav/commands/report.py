@@ -98,7 +98,8 @@ def _words(artist: "Artist") -> Iterator["Text"]:
 
 def corners_in_world(markers: MarkerMap) -> Float[np.ndarray, "M 4 3"]:
     """Corners (M, 4, 3) of a map in the world of its file, m, float64."""
-    return np.asarray(points_in_world(markers.corners_world_m, markers.origin_m), float)
+    corners_m = jax.jit(lambda: markers.corners_world_m)()  # one program in place of dozens
+    return np.asarray(points_in_world(corners_m, markers.origin_m), float)
 
 
 def normals_px(

@@ -14,6 +14,7 @@ import inspect
 import os
 import pickle
 import platform
+import sys
 import time
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
@@ -156,7 +157,8 @@ def _asked(
     """The name of a program's file, and the structure and leaves of its arguments."""
     leaves, given = jax.tree.flatten(arguments)
     inputs = jax.eval_shape(lambda: [jnp.asarray(leaf) for leaf in leaves])
-    own = hashlib.blake2b(Path(inspect.getfile(function)).read_bytes(), digest_size=8).hexdigest()
+    source = Path(str(sys.modules[function.__module__].__file__)).read_bytes()
+    own = hashlib.blake2b(source, digest_size=8).hexdigest()
     called = f"{function.__module__}.{function.__qualname__}", own
     return _file(str((called, given, *static.items())), inputs), given, inputs
 

@@ -105,8 +105,7 @@ def localise(
         the last frame means nothing.
     """
     tracks, begins = len(navigator.markers.ids) if alone else 1, range(0, frames, CHUNK_FRAMES)
-    start = _alone(navigator, 0) if alone else navigator
-    beliefs = _repeated(start.init().belief, tracks)
+    beliefs = _first_beliefs(_alone(navigator, 0) if alone else navigator, tracks=tracks)
     filtered: list[_Packed] = []
     for begin in begins:
         obs = _chunk(observations(begin))
@@ -124,26 +123,30 @@ def localise(
         yield begin, poses
 
 
+@kept
+def _first_beliefs(navigator: Navigator, *, tracks: int) -> Belief:
+    return _repeated(navigator.init().belief, tracks)
+
+
 def _repeated(tree: Any, count: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), tree)
 
 
 def _chunk(obs: Observation) -> Observation:
     """Frames, padded by the last one again, which then shows nothing and is at the same time."""
-    count = len(obs.visible)
+    known = np.arange(CHUNK_FRAMES) < len(obs.visible)
     whole: Observation = jax.tree.map(lambda leaf: padded(leaf, CHUNK_FRAMES), obs)
-    known = jnp.arange(CHUNK_FRAMES) < count
-    visible = whole.visible & known[:, None, None]
-    shown = visible, whole.has_odometry & known, whole.dt_s * known
+    shown = whole.visible & known[:, None, None], whole.has_odometry & known, whole.dt_s * known
     padding_blind: Observation = eqx.tree_at(
         lambda o: (o.visible, o.has_odometry, o.dt_s), whole, shown
     )
     return padding_blind
 
 
-def padded(rows: np.ndarray, count: int) -> Array:
+def padded(rows: Array | np.ndarray, count: int) -> np.ndarray:
     """Pad rows to a number of them by repeating the last one."""
-    return jnp.asarray(np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)]))
+    rows = np.asarray(rows)
+    return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
 
 
 @kept
@@ -307,11 +310,11 @@ def smooth_drive(
         setup: its navigator filters.
         progress: called with the number of events done since the last call, twice for each.
     """
-    found, total = [], len(events)
+    found, total, obs = [], len(events), jax.device_get(events.obs)
     for begin, poses in localise(
         setup.navigator(),
         total,
-        lambda begin: jax.tree.map(lambda leaf: leaf[begin : begin + CHUNK_FRAMES], events.obs),
+        lambda begin: jax.tree.map(lambda leaf: leaf[begin : begin + CHUNK_FRAMES], obs),
         smooth=True,
     ):
         found.append(jax.device_get(jax.tree.map(lambda leaf: leaf[:, 0], poses)))

@@ -7,12 +7,14 @@ import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxnav.core.filter.choose import Branch, Selector, judge_branch
 from jaxnav.core.filter.free import ConstantVelocity, FreeBody
@@ -206,20 +208,23 @@ def _observations(recording: Recording, motions: _Motions, begin: int) -> Observ
     known = known if imu is None else known | (imu.duration_s > 0)
     dt_s = np.where(known, dt_s, np.clip(dt_s, 0, MAX_DT_S))
     fields = {"dt_s": dt_s, "twist": twists, "imu": imu}
-    obs: Observation = jax.vmap(lambda lanes, fields: Observation(*lanes, **fields))(
-        recording.lanes(frames), fields
-    )
-    return obs
+    return _observed(recording.lanes(frames), fields)
 
 
-def _truth(recording: Recording, begin: int) -> Array:
+@jax.jit
+@jax.vmap
+def _observed(lanes: tuple[Array, Array], fields: dict[str, Any]) -> Observation:
+    return Observation(*lanes, **fields)
+
+
+def _truth(recording: Recording, begin: int) -> np.ndarray:
     """The reference of a chunk in the coordinates of the map, (CHUNK_FRAMES, 7)."""
     truth = np.tile([1.0, 0, 0, 0, 0, 0, 0], (CHUNK_FRAMES, 1))
     if recording.reference is not None:
         there = opposite(recording.markers.origin_m)
         rows = recording.reference.T_world_vehicle[begin : begin + CHUNK_FRAMES]
         truth[: len(rows)] = poses_in_world(rows, there)
-    return jnp.asarray(truth)
+    return truth
 
 
 def frames_in_view(seen: Bool[np.ndarray, "F tracks"]) -> Int[np.ndarray, "F tracks"]:
@@ -236,11 +241,13 @@ def errors(
     reference = recording.reference
     assert reference is not None
     known = replay.seen & reference.valid[:, None]
-    estimate = jaxlie.SE3(jnp.asarray(replay.T_world_vehicle))
-    truth = jaxlie.SE3(
-        jnp.broadcast_to(jnp.asarray(reference.T_world_vehicle)[:, None], estimate.wxyz_xyz.shape)
+    shape = replay.T_world_vehicle.shape
+    estimate = replay.T_world_vehicle[known]
+    truth = np.broadcast_to(reference.T_world_vehicle[:, None], shape)[known]
+    turned, wanted = (
+        Rotation.from_quat(poses[:, :4], scalar_first=True) for poses in (estimate, truth)
     )
-    position_m = np.linalg.norm(estimate.translation() - truth.translation(), axis=-1)
-    wxyz = np.asarray((estimate.rotation().inverse() @ truth.rotation()).wxyz)
-    rotation_rad = 2 * np.arctan2(np.linalg.norm(wxyz[..., 1:], axis=-1), np.abs(wxyz[..., 0]))
-    return np.where(known, position_m, np.nan), np.where(known, np.rad2deg(rotation_rad), np.nan)
+    position_m, rotation_deg = np.full((2, *known.shape), np.nan)
+    position_m[known] = np.linalg.norm(estimate[:, 4:] - truth[:, 4:], axis=1)
+    rotation_deg[known] = np.rad2deg((turned.inv() * wanted).magnitude())
+    return position_m, rotation_deg
