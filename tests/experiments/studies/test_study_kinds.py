@@ -218,7 +218,7 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
         assert (odometry.spin, odometry.spin_from_s) == (0.2, 0)
         assert odometry.speed_scale == usual.odometry.speed_scale
         assert odometry.steering_offset_rad == pytest.approx(np.deg2rad(-3))
-        assert float(study.rollout(cell, scenario).corner_drift_px) == pytest.approx(0.7)
+        assert scenario.corner_drift_px == pytest.approx(0.7)
     (tmp_path / "s.yaml").write_text("trials: 2\naxes: {corner_lag_s: [0.05, 0.1]}\n")
     with pytest.raises(BadInput, match=r"axes\.corner_lag_s\[1\]: must be >= 0 and <= 0\.0666"):
         load_study("drive", tmp_path / "s.yaml")
@@ -226,7 +226,7 @@ def test_a_drive_study_varies_errors_that_repeat(tmp_path: Path) -> None:
     own = load_study("drive", tmp_path / "s.yaml")
     assert isinstance(own, DriveStudy)
     cell = own.config.cell((0,))
-    assert float(own.rollout(cell, own.scenario(cell)).corner_drift_px) == 0.5
+    assert own.scenario(cell).corner_drift_px == 0.5
 
 
 def test_a_drive_study_varies_what_drives_and_its_gyro(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def keep_the_compile_cache(monkeypatch):
 @pytest.fixture
 def run_banks_fast(monkeypatch):
     """A bank takes longer over a whole recording than to be optimised."""
-    fast = jit_to_run(filter_frames.__wrapped__, static_argnums=(3, 4))
+    fast = jit_to_run(filter_frames.__wrapped__, static_argnames=("alone", "keep"))
     monkeypatch.setattr(localise, "filter_frames", fast)
     monkeypatch.setattr(localise, "smooth_frames", jit_to_run(smooth_frames.__wrapped__))
 
