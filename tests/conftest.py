@@ -121,7 +121,7 @@ def data_dir() -> Path:
     return path
 
 
-@pytest.fixture(scope="module", params=["crawler", "slider"])
+@pytest.fixture(scope="module", params=["crawler", pytest.param("slider", marks=pytest.mark.long)])
 def stranger(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> strangers.Stranger:

@@ -91,6 +91,7 @@ def test_an_own_vehicle_is_driven(monkeypatch):
     assert np.hypot(*(true_pose - outcome.pose)[:2]) < 0.1
 
 
+@pytest.mark.long
 def test_a_drive_is_many_drives_under_vmap():
     told = importlib.import_module("ten_thousand_drives").main(6, "paper-cost", duration_s=8.0)
     assert told["success"].shape == told["wrong_start"].shape == (6,)
@@ -98,6 +99,7 @@ def test_a_drive_is_many_drives_under_vmap():
     assert not (told["success"] & told["wrong_start"]).all()
 
 
+@pytest.mark.long
 def test_the_gradient_is_that_of_a_finite_difference():
     gradient, difference = importlib.import_module("gradient").main(frames=6)
     assert np.abs(gradient).max() > 1e-3

@@ -88,6 +88,7 @@ def step_by_step(nav: Navigator, obs: Observation) -> tuple[State, Output]:
     return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outputs)
 
 
+@pytest.mark.long
 def test_step_scan_and_vmap_agree():
     """Everything a user reads; of a lane that no one takes as much as LM's stopping rule leaves."""
     nav = navigator()

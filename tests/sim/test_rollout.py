@@ -130,7 +130,7 @@ def test_a_drive_takes_the_place_of_one_that_has_ended(monkeypatch):
         np.testing.assert_array_equal(a, b[::-1])
 
 
-@pytest.mark.parametrize("bank", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.parametrize("bank", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_programs_with_fewer_slots_compute_the_same(bank, monkeypatch):
     """From a start with all hypotheses to one; one sighting, two and none; the marker seen again
     after a tunnel, and a car that is carried off."""

@@ -132,6 +132,7 @@ def test_videos_and_folders_of_several_cameras_go_together(shots, tmp_path, caps
     assert f"write where its cameras are into {file}" in told
 
 
+@pytest.mark.long
 def test_a_marker_is_looked_at_again_with_the_lens_it_told(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(choice, "FEWEST_VIEWS", 100)  # which compiles long
     rendered(tmp_path / "shots", MARKER, 12, seed=5, distances_m=(0.15, 0.4), fewest=4)

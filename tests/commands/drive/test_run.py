@@ -176,6 +176,7 @@ def assert_arrived(ended: Ended) -> None:
     assert ended.told[-1].throttle == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("family", "marker_id"),
     [("tag36h11", 5), pytest.param("4x4_50", 17, marks=pytest.mark.long)],
@@ -221,6 +222,7 @@ def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
     assert f"recorded {count} messages in {drive.record}" in ended.out
 
 
+@pytest.mark.long
 def test_a_simulated_drive_that_was_suspended_goes_on(workplace, tmp_path):
     """As of a computer that had no core for it: no deadline of the simulation has passed."""
     with driving(workplace, tmp_path) as drive:
@@ -232,7 +234,9 @@ def test_a_simulated_drive_that_was_suspended_goes_on(workplace, tmp_path):
         assert_arrived(drive.ended())
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
+)
 def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
     with driving(workplace, tmp_path) as drive:
         signalled_ns = time.monotonic_ns()
@@ -306,7 +310,12 @@ def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("how", "end"), [("stopped", "SIGINT"), ("held", "SIGHUP"), ("held", "time is over")]
+    ("how", "end"),
+    [
+        ("stopped", "SIGINT"),
+        pytest.param("held", "SIGHUP", marks=pytest.mark.long),
+        ("held", "time is over"),
+    ],
 )
 def test_a_guard_that_hangs_before_the_end_is_replaced_and_that_is_said(
     workplace, tmp_path, how, end
@@ -432,6 +441,7 @@ def test_of_a_drive_that_is_killed_the_recording_lacks_less_than_the_last_second
     assert 0 <= (killed_ns - log.outcomes.now_ns[-1]) / 1e9 < 1.0
 
 
+@pytest.mark.long
 def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tmp_path):
     with driving(workplace, tmp_path) as drive:
         # No file of the process may grow beyond this any more.

@@ -39,6 +39,7 @@ TRAJECTORIES = (
 )
 
 
+@pytest.mark.long
 def test_both_methods_drive_from_images_and_one_listens(tmp_path, capsys, monkeypatch):
     """What people use otherwise drives by itself, and hears the images of our drive."""
     made = {}

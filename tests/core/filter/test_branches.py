@@ -50,7 +50,10 @@ def both_fits(prior, snapshot, elsewhere):
     return fit_poses(T, P, None, prior, snapshot, jnp.zeros(6), 40, elsewhere)
 
 
-@pytest.mark.parametrize("freedom", [PLANAR, EYE], ids=["car", "free"])
+@pytest.mark.parametrize(
+    "freedom",
+    [pytest.param(PLANAR, id="car", marks=pytest.mark.long), pytest.param(EYE, id="free")],
+)
 def test_a_branch_is_the_product_of_two_gaussians(freedom):
     """Prediction times corners, these linear about another pose: mean, covariance, evidence."""
     d = freedom.shape[1]

@@ -527,6 +527,7 @@ def test_a_parked_car_far_away_does_not_know_at_first_and_says_so():
     assert np.mean(wrong[sure]) < 0.01
 
 
+@pytest.mark.long
 def test_a_parked_car_whose_image_says_nothing_stays_undecided():
     """Corners that are four times worse: the five seconds are over before it could know."""
     seen = parked(4.0)
@@ -668,6 +669,7 @@ def test_it_recovers_from_being_carried_off(kidnapped):
     assert np.all(seen.decided[:, two_seconds:])
 
 
+@pytest.mark.long
 @in_float32
 def test_a_step_has_finite_gradients(precision):
     """Of the whole step with the bank, started and not, seeing (from the side, and exactly

@@ -64,6 +64,7 @@ def frames():
     return seen
 
 
+@pytest.mark.long
 def test_a_wall_of_markers_flips_and_says_how_probably(frames):
     probability, flipped, pair = frames(0.0)
     assert np.mean(pair) > 0.1

@@ -65,6 +65,7 @@ def lagged(drive):
     return run(navigator(lag_s=LAG_S, lag_observations=16), drive[0])
 
 
+@pytest.mark.long
 def test_a_lag_leaves_the_filter_as_it_is(filtered, lagged):
     (belief, out), (same, also) = filtered, lagged
     assert out.lagged is None

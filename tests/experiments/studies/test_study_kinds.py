@@ -167,6 +167,7 @@ def test_a_lane_that_overflows_is_counted(tmp_path: Path) -> None:
     assert np.isfinite(summary["position_error_m_median"].values[0])
 
 
+@pytest.mark.long
 def test_drives_are_those_of_simulate(tmp_path: Path) -> None:
     (tmp_path / "s.yaml").write_text(
         "trials: 6\nseed: 3\naxes: {corner_noise_px: [0.3, 1.0]}\n"

@@ -306,6 +306,7 @@ def test_a_gyro_s_numbers_are_learned_by_their_gradients():
     assert np.abs(found).min() > 1e-6
 
 
+@pytest.mark.long
 def test_frames_that_are_not_used_say_nothing():
     """Whatever they hold; and what was said before them stays, bit for bit."""
     start, drive = first_of((starts().bank, recorded()))

@@ -197,6 +197,7 @@ def test_without_a_marker_the_pose_goes_on_by_the_odometry_alone(test_7):
     assert np.linalg.norm((over.inverse() @ truth).translation()) < 0.2
 
 
+@pytest.mark.long
 def test_a_recording_without_a_reference_gives_a_track_and_no_errors(
     test_7, tmp_path, monkeypatch, capsys
 ):
@@ -210,6 +211,7 @@ def test_a_recording_without_a_reference_gives_a_track_and_no_errors(
     assert "error" not in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     folder = str(data_dir / "tagslam" / "test_7")
     args = ["--one-at-a-time", "--selector", "lowest-reprojection", "--limit", "300"]
