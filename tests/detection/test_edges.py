@@ -48,7 +48,9 @@ def for_screens(image: np.ndarray) -> np.ndarray:
     return np.round(255 * coded).astype(np.uint8)
 
 
-@pytest.mark.parametrize(("side_px", "count"), [(320, 4), (60, 24), (28, 24)])
+@pytest.mark.parametrize(
+    ("side_px", "count"), [pytest.param(320, 4, marks=pytest.mark.long), (60, 24), (28, 24)]
+)
 def test_levels_that_are_coded_for_screens_move_no_corner(side_px, count):
     """An edge's middle is then too light: taken for linear, outlines shrink by 0.2 px and more."""
     errors, sigmas, outwards = errors_px(side_px, count, seed=1, optics_px=0.6, coded=True)

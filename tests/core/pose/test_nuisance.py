@@ -292,6 +292,7 @@ def test_one_camera_alone_finds_the_same_minimum(view):
     assert np.max(linalg.eigvalsh(both, exact.covariance)) > 20
 
 
+@pytest.mark.long
 def test_gradients_are_differences():
     """Of pose, covariance and cost by the corners, the cameras' places and their sigmas."""
     rig, markers = worlds.qcar_rig(), worlds.room_markers()
