@@ -13,7 +13,7 @@ import pytest
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.navigator import Navigator
-from jaxnav.detection import make_detector, marker_cells
+from jaxnav.detection import ArucoDetector, make_detector, marker_cells
 from jaxnav.detection.types import Detections
 from jaxnav.drive.expect import Region
 from jaxnav.drive.flags import Fault
@@ -290,7 +290,7 @@ def test_where_it_is_expected_it_is_found_as_in_the_whole_image(
 ):
     whole = looked(camera, image).detections
     search = new_search(camera)
-    monkeypatch.setattr(Search, "_everywhere", None)  # not asked
+    monkeypatch.setattr(ArucoDetector, "detect", None)  # which looks everywhere
     near = search.look(Frame(BEGIN_NS, image), around(corners_px, off_px)).detections
     assert_found(near, whole.corners_px, 0.05)
 
