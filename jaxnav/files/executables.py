@@ -71,7 +71,7 @@ class kept:
         static = [one.name for one in parameters if one.kind is one.KEYWORD_ONLY]
         self.jitted = jax.jit(function, static_argnames=static)
         self._function = function
-        self._ready: dict[Hashable, Callable[..., PyTree]] = {}
+        self._ready: dict[Hashable, tuple[Run, PyTreeDef] | None] = {}
         update_wrapper(self, function)
 
     def __call__(self, *arguments: PyTree, **static: Hashable) -> PyTree:
@@ -80,25 +80,20 @@ class kept:
             return self.jitted(*arguments, **static)
         kind = given, *static.items(), *((np.shape(x), jnp.result_type(x)) for x in leaves)
         if kind not in self._ready:
-            self._ready[kind] = partial(self.jitted, **static)
-            if all_ours(arguments):
-                self._ready[kind] = _call(
-                    *program(self._function, arguments, _folders[-1], static),
-                    [jnp.result_type(leaf) for leaf in leaves],
-                )
-        return self._ready[kind](*arguments)
-
-
-def _call(run: Run, structure: PyTreeDef, types: list[np.dtype]) -> Callable[..., PyTree]:
-    def call(*arguments: PyTree) -> PyTree:
+            ours = all_ours(arguments)
+            self._ready[kind] = (
+                program(self._function, arguments, _folders[-1], static) if ours else None
+            )
+        ready = self._ready[kind]
+        if ready is None:
+            return self.jitted(*arguments, **static)
+        run, structure = ready
         # Plain numbers among the leaves become arrays.
-        leaves = [
-            leaf if hasattr(leaf, "dtype") else np.asarray(leaf, dtype)
-            for leaf, dtype in zip(jax.tree.leaves(arguments), types, strict=True)
+        arrays = [
+            leaf if hasattr(leaf, "dtype") else np.asarray(leaf, jnp.result_type(leaf))
+            for leaf in leaves
         ]
-        return jax.tree.unflatten(structure, run(leaves))
-
-    return call
+        return jax.tree.unflatten(structure, run(arrays))
 
 
 def all_ours(tree: PyTree) -> bool:
