@@ -25,7 +25,8 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.sim.traces import DriveTraces
 
 _POOL = 1024  # drives under way at once on a thread
-_FEW = 32  # so many drives don't pay for a second program
+# So many drives don't pay for a second program, nor for a third.
+_ONE, _TWO = 32, 512
 _ACCELERATOR_DRIVES = 2048
 
 
@@ -86,10 +87,11 @@ def program_sizes(navigator: Navigator, drives: int) -> list[Slots]:
     if jax.default_backend() != "cpu":
         return [Slots(min(drives, _ACCELERATOR_DRIVES))]
     whole = Slots(min(drives, 16))
-    if drives <= _FEW or type(navigator) is not Navigator:
+    if drives <= _ONE or type(navigator) is not Navigator:
         return [whole]
     if isinstance(navigator.selector, MultiHypothesis):
-        return [Slots(64, 1, 2), Slots(32, 2, 8), whole]
+        between = [Slots(32, 2, 8)] if drives > _TWO else []
+        return [Slots(64, 1, 2), *between, whole]
     several = navigator.no_candidates().valid.shape[0] > 2  # two candidates a sighting
     return [Slots(64, 1), whole] if several else [whole]
 

@@ -35,7 +35,6 @@ from jaxnav.recordings.other.recordings import read_recording
 from jaxnav.recordings.other.replay import estimate_corner_sigma_px
 from jaxnav.sim.rollout import Rollout
 
-AT_A_TIME = 64  # sequences in a batch, where nothing is to be differentiated
 _TEST_SEED = 10**6
 _HELD_OUT = 4  # one of this many sequences of a recording is held out
 _DRIVE = ".mcap"

@@ -3,14 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.process import collect_garbage_rarely, configure_jax
 from jaxnav.commands.simulate.arguments import TuneFilter as Arguments
-from jaxnav.commands.tune.data import AT_A_TIME, TuningData, read_data
+from jaxnav.commands.tune.data import TuningData, read_data
 from jaxnav.commands.tune.fit import Fitting, measure, plain_key, run_fit
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.planar import BicycleKalman
@@ -137,15 +136,8 @@ def _tested(
 def _test(
     navigator: Navigator, test: FrameSequences, progress: Callable[[int], object]
 ) -> EstimatorScores:
-    size, parts = min(len(test), AT_A_TIME), []
-    for begin in range(0, len(test), size):
-        rows = np.minimum(np.arange(begin, begin + size), len(test) - 1)
-        some = jax.device_get(estimate_sequences(navigator, test.rows(rows)))
-        kept = min(size, len(test) - begin)
-        parts.append((np.asarray(some.square_m2)[:kept], np.asarray(some.nees)[:kept]))
-        progress(kept)
-    judged = np.asarray(test.judged)
-    square_m2, nees = (np.concatenate(leaf) for leaf in zip(*parts, strict=True))
+    estimates = estimate_sequences(navigator, test, progress)
+    square_m2, nees, judged = map(np.asarray, (estimates.square_m2, estimates.nees, test.judged))
     definite = judged & ~np.isnan(nees)
 
     def mean(values: np.ndarray, counted: np.ndarray) -> tuple[float, float, float]:

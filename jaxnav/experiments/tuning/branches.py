@@ -7,11 +7,13 @@ the filter is smooth in its noise parameters.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxnav.core.filter.bank import Bank, heaviest
@@ -33,6 +35,7 @@ from jaxnav.files.executables import kept
 # the two poses of a marker where they can be mistaken for each other.
 _CARRIED_SIGMA = 0.3
 _LEAST_SHARE = 1e-4  # added to the diagonal of the correlation matrix
+_SEQUENCES, _FRAMES = 32, 64  # estimated in one call
 
 
 class SequenceEstimates(eqx.Module):
@@ -44,11 +47,55 @@ class SequenceEstimates(eqx.Module):
     decided: Bool[Array, "*B T"]
 
 
-@kept
-def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> SequenceEstimates:
-    """Estimate all sequences from cold starts. Frames not used or judged hold no valid values."""
+def estimate_sequences(
+    navigator: Navigator,
+    recorded: FrameSequences,
+    progress: Callable[[int], object] = lambda count: None,
+) -> SequenceEstimates:
+    """Estimate all sequences from cold starts. Frames not used or judged hold no valid values.
 
-    def one(recorded: FrameSequences) -> SequenceEstimates:
+    Some sequences and frames at a time, so that one program serves any number of both.
+
+    Args:
+        progress: called with the number of sequences estimated since the last call.
+    """
+    count, frames = recorded.used.shape
+    whole = jax.device_get(recorded.pad_to(-(-frames // _FRAMES) * _FRAMES))
+    first = jax.tree.map(
+        lambda leaf: np.broadcast_to(leaf, (_SEQUENCES, *leaf.shape)),
+        jax.device_get(_cold(navigator)),
+    )
+    parts = []
+    for begin in range(0, count, _SEQUENCES):
+        some = whole.rows(np.minimum(np.arange(begin, begin + _SEQUENCES), count - 1))
+        state, estimates = first, []
+        for at in range(0, whole.used.shape[1], _FRAMES):
+            state, estimate = _estimated(navigator, state, some.frames(slice(at, at + _FRAMES)))
+            estimates.append(jax.device_get(estimate))
+        kept_rows = min(_SEQUENCES, count - begin)
+        parts.append(
+            jax.tree.map(
+                lambda *leaves: np.concatenate(leaves, axis=1)[:kept_rows, :frames],  # noqa: B023
+                *estimates,
+            )
+        )
+        progress(kept_rows)
+    joined: SequenceEstimates = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return joined
+
+
+@kept
+def _cold(navigator: Navigator) -> State:
+    return navigator.init()
+
+
+@kept
+def _estimated(
+    navigator: Navigator, states: State, recorded: FrameSequences
+) -> tuple[State, SequenceEstimates]:
+    """The states of sequences some frames later, and the estimate of each frame."""
+
+    def one(state: State, recorded: FrameSequences) -> tuple[State, SequenceEstimates]:
         local = eqx.tree_at(lambda n: n.markers, navigator, recorded.markers)
 
         def frame(
@@ -68,9 +115,9 @@ def estimate_sequences(navigator: Navigator, recorded: FrameSequences) -> Sequen
             )
 
         frames = (recorded.obs, recorded.used, recorded.T_world_vehicle_true)
-        return jax.lax.scan(frame, local.init(), frames)[1]
+        return jax.lax.scan(frame, state, frames)
 
-    return jax.vmap(one)(recorded)
+    return jax.vmap(one)(states, recorded)
 
 
 def error_of(motion: Motion, mean: Float[Array, " n"], T_true: jaxlie.SE3) -> Float[Array, " d"]:
@@ -107,11 +154,11 @@ class SequenceStarts(eqx.Module):
 def find_starts(navigator: Navigator, recorded: FrameSequences) -> SequenceStarts:
     """The start of every sequence, as this navigator decided."""
     seen = estimate_sequences(navigator, recorded)
-    chosen = jnp.any(seen.decided, axis=1)
-    first = jnp.argmax(seen.decided, axis=1)
-    rows = jnp.arange(len(recorded))
-    poses = _carried_back(navigator, recorded.obs, seen.T_world_vehicle[rows, first], first)
-    return SequenceStarts(_around(navigator, poses), chosen)
+    decided = np.asarray(seen.decided)
+    first = np.argmax(decided, axis=1)
+    poses = np.asarray(seen.T_world_vehicle)[np.arange(len(recorded)), first]
+    poses = _carried_back(navigator, recorded.obs, poses, first)
+    return SequenceStarts(_around(navigator, poses), jnp.asarray(decided.any(axis=1)))
 
 
 @kept

@@ -33,6 +33,11 @@ class FrameSequences(eqx.Module):
         some: FrameSequences = jax.tree.map(lambda leaf: leaf[rows], self)
         return some
 
+    def frames(self, frames: slice) -> "FrameSequences":
+        """Some of the frames of all sequences."""
+        timed = (self.obs, self.used, self.T_world_vehicle_true, self.judged)
+        return FrameSequences(self.markers, *jax.tree.map(lambda leaf: leaf[:, frames], timed))
+
     @staticmethod
     def concatenate(parts: "list[FrameSequences]") -> "FrameSequences":
         """Concatenate the sequences; shorter ones are padded with unused frames."""
