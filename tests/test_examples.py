@@ -46,6 +46,7 @@ def test_the_car_decides_and_drives_to_its_waypoints():
     assert time_s < 15
 
 
+@pytest.mark.long
 def test_an_own_selector_steers_too():
     module = importlib.import_module("own_selector")
     assert isinstance(module.SteadyHeading(), jn.Selector)
@@ -74,6 +75,7 @@ def test_an_own_vehicle_keeps_its_promises_and_the_simulated_cameras_look_at_its
         sim.open_cameras(setup, None)
 
 
+@pytest.mark.long
 def test_an_own_vehicle_is_driven(monkeypatch):
     """By the loop's pilot, 50 times a second of the test's own clock."""
     module, navigator, setup = _own_vehicle()
@@ -113,6 +115,7 @@ def test_a_rig_is_calibrated():
     assert told["after"][1] < 0.1
 
 
+@pytest.mark.long
 def test_a_recording_is_run_again_by_another_selector():
     told = importlib.import_module("read_recording").main()
     assert told["inputs"] > 100

@@ -57,6 +57,7 @@ def test_readings_are_corrected_as_the_pilot_corrects_them(setup, tmp_path):
     np.testing.assert_allclose(read, 1.1 * np.array(raw))
 
 
+@pytest.mark.long
 def test_a_base_s_drive_has_its_twist_and_its_gyro(tmp_path):
     """Twists as read, and the turn of every interval as the base has turned in it."""
     base = equipped(worlds.qcar(), "differential", "consumer")

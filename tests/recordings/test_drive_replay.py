@@ -258,6 +258,7 @@ def test_with_something_changed_both_tracks_are_drawn(drive, tmp_path, capsys):
     assert "off the recorded track by" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_drive_with_parameters_of_its_own_is_replayed_bit_for_bit(tuned, tmp_path, capsys):
     path, told = tuned
     code, summary = replayed(tmp_path / "own", path)
@@ -276,6 +277,7 @@ def test_a_drive_with_parameters_of_its_own_is_replayed_bit_for_bit(tuned, tmp_p
     assert f"1 parameter from {params} (loss: 0.5)\n" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_ros_bag_is_driven_too(drive, tmp_path):
     route, waypoints_m = tmp_path / "route.yaml", [list(point) for point in WAYPOINTS_M]
     start = "{x_m: 2.0, y_m: -1.0, psi_deg: 125.0}"

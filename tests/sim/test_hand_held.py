@@ -108,6 +108,7 @@ def navigator(motion=None) -> Navigator:
     return Navigator(RIG, MARKER, motion=motion)
 
 
+@pytest.mark.long
 def test_errors_are_as_large_as_said_with_a_marker_now_and_then():
     """Eight hands; the marker is hidden from 4 to 6.5 s and from 8 to 9 s."""
     times_s = STAMPS_NS / 1e9

@@ -187,6 +187,7 @@ def test_cameras_and_sensors_are_off_as_their_files_tell():
         np.testing.assert_array_equal(wxyz_xyz, RIG.Ts_camera_vehicle.wxyz_xyz)
 
 
+@pytest.mark.long
 def test_what_the_default_claims_is_true_where_errors_are_as_told():
     """Its covariance is that of its errors, within a third; half or twice of it would show."""
     scenario = dataclasses.replace(scenarios()["as-told"], duration_s=2.0)

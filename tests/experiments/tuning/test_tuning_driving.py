@@ -136,6 +136,7 @@ class TurnsByGyro(Knows):
         return super().step(state, obs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("left_limit_mps", [0.0, 0.6], ids=["differential", "omni"])
 def test_derivatives_of_a_base_s_drive(left_limit_mps):
     """Against central differences, with a gyro that reads what the gains have made it turn."""
@@ -201,6 +202,7 @@ def test_a_gain_that_does_nothing_is_found(tame):
     assert without_gradient(slopes, space.labels) == ["controller.integral_limit_ms"]
 
 
+@pytest.mark.long
 def test_a_long_drive_needs_no_more_memory(tame):
     """Nothing is remembered on the way: the program of some frames is all there is."""
     space = space_of(tame)

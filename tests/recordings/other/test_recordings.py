@@ -34,7 +34,9 @@ def recording(request, data_dir) -> tuple[Recording, Recording]:
 # --- the real recordings --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["test_2", "test_21", "test_22", "test_9"])
+@pytest.mark.parametrize(
+    "name", ["test_2", "test_21", "test_22", pytest.param("test_9", marks=pytest.mark.long)]
+)
 def test_every_public_recording_is_read(data_dir, name):
     """Lenses with k3 too, which test_21 has."""
     read = read_recording(data_dir / "tagslam" / name)

@@ -159,6 +159,7 @@ def bag_of(walk) -> Bag:
     return bag
 
 
+@pytest.mark.long
 def test_a_walk_goes_on_by_the_imu_where_no_marker_is_in_view(walk, tmp_path):
     """And without it ends elsewhere."""
     topics = topic_map(tmp_path, TOPICS)
