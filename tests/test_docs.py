@@ -90,9 +90,9 @@ def problem_of(args: list[str]) -> str:
 COMMANDS = sorted({(command, whole) for page in PAGES for command, whole in command_lines(page)})
 
 
-@pytest.mark.parametrize("page", PAGES, ids=relative)
-def test_every_link_leads_somewhere(page: Path) -> None:
-    assert broken(page, links(without_fences(page))) == []
+def test_every_link_leads_somewhere() -> None:
+    lost = {relative(page): broken(page, links(without_fences(page))) for page in PAGES}
+    assert not {page: links for page, links in lost.items() if links}
 
 
 def test_a_broken_link_is_seen() -> None:
@@ -102,15 +102,18 @@ def test_a_broken_link_is_seen() -> None:
     assert broken(README, links("[a](#in-python) [b](docs/guide/drive.md#recordings)")) == []
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[0])
-def test_every_command_can_be_typed(command: tuple[str, bool]) -> None:
-    line, whole = command
-    for placeholder, word in PLACEHOLDERS.items():
-        line = line.replace(placeholder, word)
-    problem = problem_of(shlex.split(line)[1:])
-    # In a sentence a command may be named without all that it must be told.
-    named = problem.startswith(("Missing", "Expected one of")) and not whole
-    assert named or not problem
+def test_every_command_can_be_typed() -> None:
+    problems = {}
+    for command, whole in COMMANDS:
+        line = command
+        for placeholder, word in PLACEHOLDERS.items():
+            line = line.replace(placeholder, word)
+        problem = problem_of(shlex.split(line)[1:])
+        # In a sentence a command may be named without all that it needs.
+        named = problem.startswith(("Missing", "Expected one of")) and not whole
+        if problem and not named:
+            problems[command] = problem
+    assert not problems
 
 
 def test_commands_were_found() -> None:
@@ -120,14 +123,16 @@ def test_commands_were_found() -> None:
     assert {"demo", "replay", "locate", "simulate", "study", "tune", "calibrate"} <= names
 
 
-@pytest.mark.parametrize("page", PAGES, ids=relative)
-def test_every_file_that_is_named_is_there(page: Path) -> None:
-    text = without_fences(page)
-    named = set(re.findall(rf"(?:python|pytest) ({FOLDERS}[\w/]+\.py)", text))
-    for span in SPAN.findall(text):
-        if match := re.fullmatch(rf"({FOLDERS}[\w./-]*)(::\w+)?", span):
-            named.add(match[1])
-    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+def test_every_file_that_is_named_is_there() -> None:
+    missing = []
+    for page in PAGES:
+        text = without_fences(page)
+        named = set(re.findall(rf"(?:python|pytest) ({FOLDERS}[\w/]+\.py)", text))
+        for span in SPAN.findall(text):
+            if match := re.fullmatch(rf"({FOLDERS}[\w./-]*)(::\w+)?", span):
+                named.add(match[1])
+        missing += [(relative(page), name) for name in named if not (ROOT / name).exists()]
+    assert not missing
 
 
 @pytest.mark.parametrize("page", [README, CONTRIBUTING], ids=relative)
