@@ -51,17 +51,21 @@ def listed_markers(path):
 
 
 def test_photographs(detector, data_dir):
+    """OpenCV's decoder gives the outline of some from both sides of their edge: once is right."""
     listed = found = 0
     errors_px = []
     for photograph in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
         detections = detector.detect(cv2.imread(str(photograph)))
         # The field uses one id: anything else would be made up.
         assert set(detections.ids.tolist()) <= {0}
+        centers = detections.corners_px.mean(axis=1)
+        apart_px = np.linalg.norm(centers[:, None] - centers, axis=2)
+        assert np.min(apart_px + 1e3 * np.eye(len(centers))) > 8
         for marker_id, corners_px in listed_markers(photograph.with_suffix(".txt")):
             if np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1).mean() < 20:
                 continue
             listed += 1
-            away = detections.corners_px.mean(axis=1) - corners_px.mean(axis=0)
+            away = centers - corners_px.mean(axis=0)
             here = (detections.ids == marker_id) & (np.linalg.norm(away, axis=1) < 3)
             if here.any():
                 found += 1
@@ -89,15 +93,6 @@ def test_one_sighting_is_not_two():
     assert len(Detections.concatenate([]).once_each()) == 0
 
 
-def test_photographs_have_no_marker_twice(detector, data_dir):
-    """OpenCV's decoder gives the outline of some from both sides of their edge."""
-    for photograph in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
-        detections = detector.detect(cv2.imread(str(photograph)))
-        centers = detections.corners_px.mean(axis=1)
-        apart_px = np.linalg.norm(centers[:, None] - centers, axis=2)
-        assert np.min(apart_px + 1e3 * np.eye(len(centers))) > 8
-
-
 def small_scene(rng, side_px, blur_px):
     """The paper's marker from afar: upright, 39 degrees off its normal, before a patterned wall."""
     direction = rng.uniform(0, 2 * np.pi)
@@ -121,7 +116,11 @@ def small_scene(rng, side_px, blur_px):
 
 
 @pytest.mark.parametrize(
-    ("side_px", "blur_px", "needed"), [(14, 0, 12), (17, 0, 12), (17, 2, 12), (14, 2, 10)]
+    ("side_px", "blur_px", "needed"),
+    [
+        *(pytest.param(*case, marks=pytest.mark.long) for case in ((14, 0, 12), (17, 2, 12))),
+        (14, 2, 10),
+    ],
 )
 def test_small_markers_are_found_from_cold(side_px, blur_px, needed):
     detector = make_detector("aruco")
@@ -142,7 +141,7 @@ def test_small_markers_are_found_from_cold(side_px, blur_px, needed):
 def test_a_prediction_finds_what_a_cold_search_misses():
     detector = make_detector("aruco")
     cold = predicted = 0
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         scene = small_scene(rng, 20, 4.0)
         image, corners_px = scene.render(rng), scene.corners_px()
@@ -151,7 +150,7 @@ def test_a_prediction_finds_what_a_cold_search_misses():
         detections = detector.detect(image, predicted_corners_px=guess_px)
         predicted += len(detections)
         assert all(np.max(np.abs(c - corners_px)) < 0.5 for c in detections.corners_px)
-    assert predicted >= 12
+    assert predicted >= 6
     assert predicted >= cold
 
 
@@ -205,7 +204,7 @@ def test_nothing_is_found_where_nothing_is(detector):
 def test_frames_with_other_cells_are_not_read():
     rng = np.random.default_rng(4)
     read = 0
-    for _ in range(40):
+    for _ in range(20):
         cells = np.pad(rng.integers(0, 2, (6, 6)).astype(float), 1)
         scene = random_scene(rng, 20, cells, view_max_rad=0.6, optics_px=0.4)
         read += read_marker(scene.render(rng), scene.corners_px(), "tag36h11", Lens()) is not None

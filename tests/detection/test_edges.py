@@ -4,7 +4,6 @@ import warnings
 
 import cv2
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -49,7 +48,7 @@ def for_screens(image: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("side_px", "count"), [pytest.param(320, 4, marks=pytest.mark.long), (60, 24), (28, 24)]
+    ("side_px", "count"), [pytest.param(320, 4, marks=pytest.mark.long), (60, 12), (28, 24)]
 )
 def test_levels_that_are_coded_for_screens_move_no_corner(side_px, count):
     """An edge's middle is then too light: taken for linear, outlines shrink by 0.2 px and more."""
@@ -62,19 +61,23 @@ def test_levels_that_are_coded_for_screens_move_no_corner(side_px, count):
 @pytest.mark.parametrize(
     ("side_px", "options", "limit_px"),
     [
-        (140, {"optics_px": OPTICS_PX}, 0.03),
         (70, {"optics_px": OPTICS_PX}, 0.03),
-        (28, {"optics_px": OPTICS_PX}, 0.03),
-        (28, {}, 0.04),
-        (28, {"optics_px": OPTICS_PX, "motion_px": (3.0, 2.0)}, 0.04),
-        (17, {"optics_px": OPTICS_PX}, 0.04),
         (17, {"optics_px": OPTICS_PX, "motion_px": (2.0, 0.0)}, 0.05),
+        *(
+            pytest.param(*repeated, marks=pytest.mark.long)
+            for repeated in (
+                (140, {"optics_px": OPTICS_PX}, 0.03),
+                (28, {"optics_px": OPTICS_PX}, 0.03),
+                (28, {}, 0.04),
+                (28, {"optics_px": OPTICS_PX, "motion_px": (3.0, 2.0)}, 0.04),
+                (17, {"optics_px": OPTICS_PX}, 0.04),
+            )
+        ),
     ],
 )
 def test_corners_are_exact_unbiased_and_know_their_error(side_px, options, limit_px):
-    errors, sigmas, outwards = errors_px(
-        side_px, 24 if side_px < 100 else 6, seed=int(side_px), **options
-    )
+    count = 24 if side_px < 100 else 6
+    errors, sigmas, outwards = errors_px(side_px, count, seed=int(side_px), **options)
     assert np.sqrt(np.mean(errors**2)) < limit_px
     assert np.max(np.abs(np.mean(errors, axis=(0, 1)))) < 0.01
     assert abs(np.mean(np.sum(errors * outwards, axis=-1))) < 0.01
@@ -82,7 +85,10 @@ def test_corners_are_exact_unbiased_and_know_their_error(side_px, options, limit
     assert 0.7 < normalised < 1.3
 
 
-@pytest.mark.parametrize("levels", [(40, 420), (-90, 190)], ids=["paper full", "ink empty"])
+@pytest.mark.parametrize(
+    "levels", [(40, 420), pytest.param((-90, 190), marks=pytest.mark.long)],
+    ids=["paper full", "ink empty"],
+)  # fmt: skip
 def test_light_beyond_what_a_pixel_holds_moves_no_corner(levels):
     """Half of an edge's pixels are as full as the paper: it looks larger, or the ink does."""
     errors, sigmas, outwards = errors_px(
@@ -150,6 +156,7 @@ def test_a_wrong_picture_is_refused():
     assert not refine_corners(scene.render(rng), corners_px + 500, scene.cells, Lens()).good
 
 
+@pytest.mark.long
 def test_result_is_the_same_in_both_precisions():
     rng = np.random.default_rng(6)
     scene = random_scene(rng, 30, marker_cells(FAMILY, 3), optics_px=OPTICS_PX)
@@ -161,14 +168,15 @@ def test_result_is_the_same_in_both_precisions():
 
 
 def test_blurred_ink_equals_the_integral_and_its_slopes_the_differences():
-    K = jnp.asarray(image_model.step_corners(marker_cells(FAMILY, 7)))
+    K = image_model.step_corners(marker_cells(FAMILY, 7))
     knots = np.linspace(-1, 1, 9)
     xy = np.array([[0.31, -0.92, 0.98, 0.1], [-0.47, 0.88, -1.01, 0.74]])
     variance = np.array(
         [[0.02, 0.03, 0.01, 0.05], [0.03, 0.02, 0.015, 0.04], [0.01, -0.012, 0, 0.02]]
     )
     split = np.array([[0.05, 0.0, 0.03, 0.1], [0.0, 0.06, 0.02, 0.05]])
-    dark, slope = image_model.ink(*map(jnp.asarray, (xy, variance, split)), K)
+    ink = jax.jit(image_model.ink)
+    dark, slope = ink(xy, variance, split, K)
     sides = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
     for i in range(xy.shape[1]):
         xx, yy, both = variance[:, i]
@@ -192,7 +200,7 @@ def test_blurred_ink_equals_the_integral_and_its_slopes_the_differences():
             moved = known.copy()
             moved[index] += sign * small
             arguments = (moved, variance, split) if row < 2 else (xy, moved, split)
-            values.append(np.asarray(image_model.ink(*map(jnp.asarray, arguments), K)[0]))
+            values.append(np.asarray(ink(*arguments, K)[0]))
         difference = (values[0] - values[1]) / (2 * small)
         # By the blur the series is cut off one order apart; a blur that is off costs nothing else.
         tolerance = 1e-3 if row < 2 else 0.1 * np.max(np.abs(difference))
@@ -251,7 +259,10 @@ def textured(side_px: float, seed: int, oversampled: int) -> tuple[np.ndarray, .
     return np.round(15 + 50 * image).astype(np.uint8), corners_px, cells
 
 
-@pytest.mark.parametrize(("oversampled", "limit_px"), [(1, 0.2), (2, 0.06), (4, 0.03)])
+@pytest.mark.parametrize(
+    ("oversampled", "limit_px"),
+    [(1, 0.2), *(pytest.param(*case, marks=pytest.mark.long) for case in ((2, 0.06), (4, 0.03)))],
+)
 def test_pictures_sharper_than_any_lens_draws_give_corners_that_know_their_error(
     oversampled, limit_px
 ):
