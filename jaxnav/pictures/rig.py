@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from jaxnav.calibrate.rig.calibrate import RigCalibration
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.pictures.localisation import BLACK, BLUE, COLOURS, SKY, VERMILION, evenly
 
-_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
 _ARROWS = 400  # residuals drawn for each camera
 
 
@@ -117,7 +116,7 @@ def _draw_cameras(
     length = max(0.35 * float(spread.max()), 0.02)
     for Ts, alpha in ((given, 0.35), (Ts_vehicle_camera, 1.0)):
         for index, T in enumerate(Ts):
-            colour = _COLOURS[index % len(_COLOURS)]
+            colour = COLOURS[index % len(COLOURS)]
             foot, way = T[:3, 3], length * T[:3, 2]
             axes.annotate(
                 "", xy=(foot + way)[flat], xytext=foot[flat],
@@ -144,7 +143,7 @@ def _draw_residuals(
     width, height = size_px
     full = weight >= 1
     if len(centers_px):
-        rows = np.unique(np.linspace(0, len(centers_px) - 1, _ARROWS).astype(int))
+        rows = evenly(len(centers_px), _ARROWS)
         typical = float(np.median(np.hypot(*residuals_px.T))) or 1.0
         scale = 0.04 * width / typical
         inside = rows[full[rows]]

@@ -1,4 +1,4 @@
-"""What Rerun is told of a base that is no car: its twist, and the names of its errors."""
+"""What Rerun shows of a base that is no car: its twist, and the names of its errors."""
 
 import dataclasses
 from unittest.mock import MagicMock
@@ -11,7 +11,7 @@ from jaxnav.recordings.records import Outcomes
 from tests.helpers.drives import make_outcome
 
 
-def told(outcomes: Outcomes) -> tuple[set[str], list[list[str]]]:
+def shown(outcomes: Outcomes) -> tuple[set[str], list[list[str]]]:
     """The plots that get a value, and the names that the sensors' errors are given."""
     rerun, stream = MagicMock(), MagicMock()
     scene = RerunScene(rerun, stream, None, None, np.zeros((0, 2)))
@@ -26,11 +26,11 @@ def test_a_base_shows_its_twist_and_a_car_its_throttle():
     base = Outcomes.from_outcome(dataclasses.replace(make_outcome(1), twist=(0.1, 0.2, 0.3)))
     of_base = {"plots/forward_mps", "plots/left_mps", "plots/turn_radps"}
     of_car = {"plots/throttle", "plots/steering_rad"}
-    plots, names = told(base)
+    plots, names = shown(base)
     assert of_base <= plots
     assert not of_car & plots
     assert names == [list(SENSOR_ERRORS), list(TWIST_ERRORS)]
-    plots, names = told(car)
+    plots, names = shown(car)
     assert of_car <= plots
     assert not of_base & plots
     assert names == [list(SENSOR_ERRORS)]

@@ -186,8 +186,8 @@ def stand_in(monkeypatch, script: str) -> None:
 
 
 def test_a_window_that_is_closed_is_noticed_and_the_drive_goes_on(monkeypatch, tmp_path):
-    told = tmp_path / "environment"
-    write = f"import json, os; json.dump(dict(os.environ), open({str(told)!r}, 'w')); "
+    written = tmp_path / "environment"
+    write = f"import json, os; json.dump(dict(os.environ), open({str(written)!r}, 'w')); "
     stand_in(monkeypatch, write + LISTENS + "s.accept(); time.sleep(0.5)")
     monkeypatch.setattr(viewing, "_FLUSH_S", 0.2)
     view = opened(None, live=True)
@@ -202,7 +202,7 @@ def test_a_window_that_is_closed_is_noticed_and_the_drive_goes_on(monkeypatch, t
     view.show(make_outcome(index))
     assert view.dropped == dropped + 1
     view.close()
-    environment = json.loads(told.read_text())
+    environment = json.loads(written.read_text())
     # What Rerun takes as a wish to send no usage data.
     assert (environment["CI"], environment["FORCE_RERUN_ANALYTICS"]) == ("true", "0")
 
