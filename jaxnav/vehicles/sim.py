@@ -16,7 +16,7 @@ from jaxnav.drive.interfaces import AnyVehicle, Camera, Frame, GyroReading, HasT
 from jaxnav.drive.limits import limits_of
 from jaxnav.drive.standing_clock import WaitingClock
 from jaxnav.errors import BadInput
-from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.options import number, switch
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import SimWorld, WorldSettings
 
@@ -193,7 +193,7 @@ def open_cameras(setup: Setup, vehicle: AnyVehicle) -> Sequence[Camera]:
     if not isinstance(world, SimWorld):
         raise BadInput("--cameras", "sim looks at the `world` of a vehicle, and this one lacks it")
     renderer = None
-    if choice(setup.options, "images", ("false", "true")) == "true":
+    if switch(setup.options, "images"):
         renderer = RenderingProcess(setup.rig, setup.markers, setup.seed)
     rate_hz = number(setup.options, "rate_hz", 30.0, 1.0, 240.0)
     clock = vehicle.waiting_clock if isinstance(vehicle, HasTime) else WaitingClock()
