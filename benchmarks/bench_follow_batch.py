@@ -21,9 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import jaxnav
 from benchmarks.bench_blur import FAMILY, KINDS, drawn, predicted
 from benchmarks.bench_detection import row
-from jaxnav.detection.codes import codes_on_device
 from jaxnav.detection.patch_fit import PatchFit
-from jaxnav.detection.pattern_program import follow_pattern
+from jaxnav.detection.pattern_program import codes_on_device, follow_pattern
 from jaxnav.detection.track import first_fit
 
 BATCHES = (1, 64, 1024, 8192)

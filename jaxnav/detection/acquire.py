@@ -14,7 +14,7 @@ from jaxtyping import Shaped, UInt8
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.detection.crowd import thin_crowd
-from jaxnav.detection.families import all_cells, dictionary
+from jaxnav.detection.families import all_cells, decoder_parameters, dictionary
 from jaxnav.detection.restore import BlurredImage, likely_motions
 from jaxnav.detection.track import Target, track
 from jaxnav.detection.tracker import detections_of
@@ -101,11 +101,7 @@ def _decoder(family: str, ids: Sequence[int]) -> cv2.aruco.ArucoDetector:
     whole = dictionary(family)
     side = whole.markerSize
     few = cv2.aruco.Dictionary(whole.bytesList[np.array(ids)], side, max(side**2 // _ERRORS, 1))
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters = decoder_parameters(_PERIMETER_RATE)
     parameters.errorCorrectionRate = 1.0
     parameters.maxErroneousBitsInBorderRate = _FRAME_ERRORS
-    parameters.minMarkerPerimeterRate = _PERIMETER_RATE
-    parameters.minMarkerDistanceRate = 0.02
-    parameters.minDistanceToBorder = 1
     return cv2.aruco.ArucoDetector(few, parameters)

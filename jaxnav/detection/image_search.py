@@ -43,7 +43,7 @@ class ImageSearch:
 def size_problem(
     rig: CameraRig, camera: int, image: UInt8[np.ndarray, "rows columns *channels"]
 ) -> str | None:
-    """Say in words how the image's size differs from the camera's; None if it doesn't."""
+    """How the image's size differs from the camera's; None if it doesn't."""
     height, width = image.shape[:2]
     expected = rig.image_sizes_px[camera]
     if (width, height) == expected:

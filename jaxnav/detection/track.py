@@ -178,7 +178,9 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
     if not (fit.explained >= _LEAST_EXPLAINED and advantage >= _LEAST_ADVANTAGE):
         return None
     streak_px = np.asarray(fit.streak_px, float)
-    sigma_px = _model_sigma_px(float(np.hypot(*streak_px)), side_px)
+    # What residuals don't show: a streak as long as the marker mixes the ground into all of it.
+    streaks = min(float(np.hypot(*streak_px)) / side_px, 2.0)
+    sigma_px = _MODEL_SIGMA_PX + _STREAK_SIGMA_PX * streaks**4
     covariance = np.asarray(fit.covariance_px2, float) + sigma_px**2 * np.eye(8)
     if not np.all(np.isfinite(covariance)):
         return None
@@ -188,8 +190,3 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
         target.family, target.marker_id, corners_px, covariance, streak_px,
         float(fit.explained), float(fit.advantage), float(fit.log_likelihood_ratio),
     )  # fmt: skip
-
-
-def _model_sigma_px(streak_px: float, side_px: float) -> float:
-    """What residuals don't show: a streak as long as the marker mixes the ground into all of it."""
-    return _MODEL_SIGMA_PX + _STREAK_SIGMA_PX * min(streak_px / side_px, 2.0) ** 4

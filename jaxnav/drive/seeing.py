@@ -147,7 +147,7 @@ class Search:
         if self.tracker is None or not region.keys or frame.image is None:
             return detections
         row_time_s = _told("row_time_s", frame.row_time_s)
-        self.tracker.tell(_told("exposure_s", frame.exposure_s), row_time_s)
+        self.tracker.set_timing(_told("exposure_s", frame.exposure_s), row_time_s)
         ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
             frame.image,
