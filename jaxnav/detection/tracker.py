@@ -97,7 +97,7 @@ class Tracker:
         targets = []
         for (family, marker_id), at in missing:
             streak_px, sigma_px = (0.0, 0.0), np.inf
-            quads, within_px, flow = _apart(quads_px[at]), float(np.max(radius_px[at])), at[0]
+            quads, within_px, flow = _distinct(quads_px[at]), float(np.max(radius_px[at])), at[0]
             if flow_px_s is not None and np.all(np.isfinite(flow_px_s[flow])):
                 streak_px, sigma_px = self._streak(flow_px_s[flow])
                 ahead_px = flow_px_s[flow] * min(max(ahead_s, -_FAR_AHEAD_S), _FAR_AHEAD_S)
@@ -114,7 +114,7 @@ class Tracker:
         flows_px_s = [flow_px_s[at[0]] for _, at in missing]
         self._learn(flows_px_s, tracks)
         seen = [f for f, one in zip(flows_px_s, tracks, strict=True) if one is not None]
-        return self._of_one_time(
+        return self._at_middle_row(
             found, np.nan_to_num(np.reshape(seen, (-1, 2))), (len(image) - 1) / 2
         )
 
@@ -128,8 +128,7 @@ class Tracker:
         return _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
 
     def _credible(self, flow_px_s: np.ndarray) -> np.ndarray:
-        """The velocities, NaN where they are those of a belief that jumped: of a marker that is so
-        fast nothing can be seen."""
+        """The velocities, NaN where a marker so fast could not be seen: the estimate jumped."""
         streaks_px = self._likely_exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
         return np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
 
@@ -142,7 +141,7 @@ class Tracker:
         sigma_px = _STREAK_SIGMA_PX + share * exposure_s * speed_px_s
         return (float(streak[0]), float(streak[1])), sigma_px
 
-    def _of_one_time(
+    def _at_middle_row(
         self, found: Detections, flows_px_s: np.ndarray, middle_px: float
     ) -> Detections:
         """The corners at the time of the middle row."""
@@ -166,13 +165,13 @@ class Tracker:
             self.exposure_s = float(np.median(self._exposures_s))
 
 
-def _apart(quads_px: Float[np.ndarray, "H 4 2"]) -> Float[np.ndarray, "P 4 2"]:
+def _distinct(quads_px: Float[np.ndarray, "H 4 2"]) -> Float[np.ndarray, "P 4 2"]:
     """The quadrilaterals without those that are almost the same as an earlier one."""
-    apart = [quads_px[0]]
+    distinct = [quads_px[0]]
     for quad in quads_px[1:]:
-        if all(np.max(np.abs(quad - other)) > _SAME_PX for other in apart):
-            apart.append(quad)
-    return np.stack(apart)
+        if all(np.max(np.abs(quad - other)) > _SAME_PX for other in distinct):
+            distinct.append(quad)
+    return np.stack(distinct)
 
 
 def detections_of(tracks: Sequence[Track]) -> Detections:

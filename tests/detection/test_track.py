@@ -20,7 +20,7 @@ from jaxnav.detection.disturbance import (
 from jaxnav.detection.image_model import expose, step_corners
 from jaxnav.detection.paper import homography
 from jaxnav.detection.pattern_program import follow_pattern
-from jaxnav.detection.signs_of_life import telling
+from jaxnav.detection.signs_of_life import watched_by
 from jaxnav.detection.template import best_match
 from jaxnav.detection.track import warm_up_fits
 from tests.helpers.marker_images import random_scene
@@ -289,7 +289,7 @@ def test_a_search_gives_a_sign_of_life_before_each_fit():
     """A fit takes 5 to 20 ms; all that there is to see in an image may take half a second."""
     image, truth = other_pictures("hidden")[0]
     many, signs = np.tile(other_pictures("clean")[0][0], (3, 4)), []
-    with telling(lambda: signs.append(1)):
+    with watched_by(lambda: signs.append(1)):
         track(image, truth.camera, [target(truth, 0)])
         assert len(signs) > 10
         signs.clear()
@@ -307,7 +307,7 @@ def test_each_place_in_which_a_marker_may_be_is_a_sign_of_life():
     signs = []
     for count in (1, 4):
         signs.append([])
-        with telling(lambda: signs[-1].append(1)):
+        with watched_by(lambda: signs[-1].append(1)):
             best_match(image, FAMILY, truth.id, places_px[:count], 4.0, (0.0, 0.0), 1.0)
     assert len(signs[1]) - len(signs[0]) == 3
 

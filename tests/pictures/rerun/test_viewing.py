@@ -133,7 +133,8 @@ def test_nobody_waits_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
         go_on.wait(10)
 
     monkeypatch.setattr(viewing.RerunScene, "show", slow)
-    view = opened(tmp_path / "drive.rrd", queue_items=3)
+    monkeypatch.setattr(viewing, "_MOST_QUEUED", 3)
+    view = opened(tmp_path / "drive.rrd")
     far_apart = range(0, 400, 20)
     view.show(make_outcome(0))
     assert begun.wait(10)
