@@ -72,7 +72,6 @@ class PatternFit(NamedTuple):
     bend: Float[Array, ""]  # of levels that are half dark, grey levels
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
-    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
 
 
 class _PatternLM(NielsenLM):
@@ -232,7 +231,7 @@ def _result(y: Unknowns, window: Window) -> PatternFit:
     pixels = PixelFit(xy, residual, scale, image.dark, darkens, in_light @ basis, ink)
     return PatternFit(
         y, pixels, covariance[:8, :8], noise, weight, white, light[BEND], ratio,
-        1 - with_marker / without, (without - with_marker) / 2,
+        1 - with_marker / without,
     )  # fmt: skip
 
 

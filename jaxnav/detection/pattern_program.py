@@ -39,7 +39,6 @@ class Summary(NamedTuple):
     weight: Float[Array, ""]  # mean weight of the pixels that count, 0 to 1
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
-    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
     advantage: Float[Array, ""]  # noise variances by which the nearest other code is worse
     alike: Float[Array, ""]  # factor of the variances by which neighbours' noise is alike
 
@@ -99,7 +98,6 @@ def follow_pattern(
         jnp.sum(fit.weight) / jnp.maximum(jnp.sum(patch.used), 1),
         fit.disagreement,
         fit.explained,
-        fit.log_likelihood_ratio,
         _code_advantage(fit, window, codes),
         alike,
     )

@@ -68,7 +68,6 @@ class Track:
         streak_px: (2,), of its centre during the exposure; its sign is the expected one's.
         explained: 0 to 1, the part of the loss without a marker that the marker explains.
         advantage: noise variances by which the nearest other code of the family is worse.
-        log_likelihood_ratio: of this marker against a plain ground.
     """
 
     family: str
@@ -78,7 +77,6 @@ class Track:
     streak_px: Float[np.ndarray, " 2"]
     explained: float
     advantage: float
-    log_likelihood_ratio: float
 
     @property
     def sigma_px(self) -> Float[np.ndarray, " 4"]:
@@ -188,5 +186,5 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
         streak_px = -streak_px
     return Track(
         target.family, target.marker_id, corners_px, covariance, streak_px,
-        float(fit.explained), float(fit.advantage), float(fit.log_likelihood_ratio),
+        float(fit.explained), float(fit.advantage),
     )  # fmt: skip

@@ -86,7 +86,9 @@ class Tracker:
             image's middle row.
         """
         if flow_px_s is not None:
-            flow_px_s = self._credible(flow_px_s)
+            # A marker so fast could not be seen: the estimate jumped.
+            streaks_px = self._likely_exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
+            flow_px_s = np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
         read = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
         sides_px = [mean_side_px(quad) for quad in quads_px]
         places: dict[tuple[str, int], list[int]] = {}  # of each marker, the largest first
@@ -126,11 +128,6 @@ class Tracker:
     @property
     def _likely_exposure_s(self) -> float:
         return _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
-
-    def _credible(self, flow_px_s: np.ndarray) -> np.ndarray:
-        """The velocities, NaN where a marker so fast could not be seen: the estimate jumped."""
-        streaks_px = self._likely_exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
-        return np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
 
     def _streak(self, flow_px_s: np.ndarray) -> tuple[tuple[float, float], float]:
         """The expected streak, px, and its standard deviation."""
