@@ -14,12 +14,13 @@ from jaxtyping import Shaped, UInt8
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.detection.crowd import thin_crowd
-from jaxnav.detection.families import all_cells, dictionary
+from jaxnav.detection.families import all_cells, decoder_parameters, dictionary
 from jaxnav.detection.restore import BlurredImage, likely_motions
 from jaxnav.detection.track import Target, track
 from jaxnav.detection.tracker import detections_of
 from jaxnav.detection.types import Detections, at_scale, grey
 
+_MOTIONS = 4  # for which an image is restored, at most
 _ENLARGE = 2
 _MOST_PIXELS = 1e6
 _ERRORS = 6  # one bit of so many may be wrong
@@ -33,12 +34,10 @@ _MOST_PROPOSED = 4  # a motion: each takes some milliseconds
 class Acquirer:
     """Finds markers of known ids in blurred images. Not safe for several threads."""
 
-    def __init__(self, keys: Sequence[tuple[str, int]], motions: int = 4):
+    def __init__(self, keys: Sequence[tuple[str, int]]):
         """Args:
         keys: family and id of each marker.
-        motions: for how many motions an image is restored, at most.
         """
-        self._motions = motions
         self._ids = {
             family: sorted({i for name, i in keys if name == family})
             for family in sorted({name for name, _ in keys})
@@ -64,7 +63,7 @@ class Acquirer:
 
     def _found(self, image: np.ndarray, camera: Camera | None) -> Detections:
         blurred = BlurredImage(image)
-        for motion in likely_motions(image)[: self._motions]:
+        for motion in likely_motions(image)[:_MOTIONS]:
             restored, in_image = at_scale(blurred.restored(motion), _ENLARGE)
             targets = [
                 Target(*key, in_image(quad_px)[None], _OFF_PX, motion.streak_px, _STREAK_SIGMA_PX)
@@ -101,11 +100,7 @@ def _decoder(family: str, ids: Sequence[int]) -> cv2.aruco.ArucoDetector:
     whole = dictionary(family)
     side = whole.markerSize
     few = cv2.aruco.Dictionary(whole.bytesList[np.array(ids)], side, max(side**2 // _ERRORS, 1))
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    parameters = decoder_parameters(_PERIMETER_RATE)
     parameters.errorCorrectionRate = 1.0
     parameters.maxErroneousBitsInBorderRate = _FRAME_ERRORS
-    parameters.minMarkerPerimeterRate = _PERIMETER_RATE
-    parameters.minMarkerDistanceRate = 0.02
-    parameters.minDistanceToBorder = 1
     return cv2.aruco.ArucoDetector(few, parameters)

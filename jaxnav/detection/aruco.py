@@ -1,6 +1,7 @@
 """OpenCV's aruco decoder, with a closer look at quadrilaterals that it can't read."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Float, Shaped
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.detection.crowd import thin_crowd
-from jaxnav.detection.families import dictionary
+from jaxnav.detection.families import decoder_parameters, dictionary
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.read import frames_first, read_marker
 from jaxnav.detection.refine import mean_side_px
@@ -59,26 +60,20 @@ class ArucoDetector:
     ) -> Detections:
         """Detect all markers of the family in the image: see `Detector.detect`."""
         image = grey(image)
-        lens = Lens(camera)
         markers, unread = self._decode(image)
-        if predicted_corners_px is not None:
-            for quad in np.asarray(predicted_corners_px, float).reshape(-1, 4, 2):
-                if np.all(np.isfinite(quad)) and not any(_overlap(quad, c) for _, c in markers):
-                    markers_there, unread_there = self._decode_around(image, quad)
-                    markers += [
-                        f for f in markers_there if not any(_overlap(f[1], c) for _, c in markers)
-                    ]
-                    unread = [quad, *unread_there, *unread]
+        quads = np.zeros((0, 4, 2)) if predicted_corners_px is None else predicted_corners_px
+        for quad in np.asarray(quads, float).reshape(-1, 4, 2):
+            if np.all(np.isfinite(quad)) and not _is_among(quad, markers):
+                side_px, unread = mean_side_px(quad), [quad, *unread]
+                if side_px <= _ENLARGE_UP_TO_PX:
+                    margin_px = _SEARCH_SIDES * side_px + _SEARCH_PX
+                    there, left = self._decode_region(image, quad, margin_px)
+                    markers += [one for one in there if not _is_among(one[1], markers)]
+                    unread[1:1] = left
         if self.ids is not None and self.ids <= {marker_id for marker_id, _ in markers}:
             unread = []  # all that matter are read
-        looked_at = [corners for _, corners in markers]
-        for quad in frames_first(image, _worth_a_look(unread))[: self._closer_looks]:
-            if any(_overlap(quad, other) for other in looked_at):
-                continue
-            read = read_marker(image, quad, self.family, lens)
-            if read is not None:
-                markers.append((read[0], read[1].corners_px))
-                looked_at.append(read[1].corners_px)
+        for one in self._read(image, camera, unread, markers, self._closer_looks):
+            markers.append(one)
         return refine_detections(image, markers, self.family, camera, self.ids)
 
     def detect_near(
@@ -95,27 +90,33 @@ class ArucoDetector:
         for quad, radius in zip(quads_px, radius_px, strict=True):
             if np.all(np.isfinite(quad)) and np.isfinite(radius):
                 margin_px = _SEARCH_SIDES * mean_side_px(quad) + float(radius)
-                read, left = self._decode_region(image, quad, margin_px)
-                markers += [f for f in read if not any(_overlap(f[1], c) for _, c in markers)]
+                there, left = self._decode_region(image, quad, margin_px)
+                markers += [one for one in there if not _is_among(one[1], markers)]
                 unread += left
         if not markers:
-            lens = Lens(camera)
-            for quad in frames_first(image, _worth_a_look(unread))[:2]:
-                code = read_marker(image, quad, self.family, lens)
-                if code is not None:
-                    markers.append((code[0], code[1].corners_px))
-                    break
+            markers += islice(self._read(image, camera, unread, markers, 2), 1)
         return refine_detections(image, markers, self.family, camera, self.ids)
+
+    def _read(
+        self,
+        image: np.ndarray,
+        camera: Camera | None,
+        unread: list[np.ndarray],
+        markers: list[tuple[int, np.ndarray]],
+        looks: int,
+    ) -> Iterator[tuple[int, np.ndarray]]:
+        """The markers in the clearest of the unread quadrilaterals, but where others are."""
+        lens = Lens(camera)
+        for quad in frames_first(image, _worth_a_look(unread))[:looks]:
+            if not _is_among(quad, markers):
+                read = read_marker(image, quad, self.family, lens)
+                if read is not None:
+                    yield read[0], read[1].corners_px
 
     def _decoder(self, perimeter_rate: float) -> cv2.aruco.ArucoDetector:
         """The decoder whose least perimeter is this part of the image's longer side."""
         if perimeter_rate not in self._decoders:
-            parameters = cv2.aruco.DetectorParameters()
-            parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-            # With the default, the paper's outline swallows the marker: 3 of 10 frames are lost.
-            parameters.minMarkerDistanceRate = 0.02
-            parameters.minDistanceToBorder = 1  # with the default of 3, whole markers are left out
-            parameters.minMarkerPerimeterRate = max(perimeter_rate, _PERIMETER_RATE)
+            parameters = decoder_parameters(max(perimeter_rate, _PERIMETER_RATE))
             self._decoders[perimeter_rate] = cv2.aruco.ArucoDetector(
                 dictionary(self.family), parameters
             )
@@ -136,14 +137,6 @@ class ArucoDetector:
         if left is not image:
             others = frames_first(image, _worth_a_look(others))[:_LOOKS_IN_A_CROWD]
         return markers, others
-
-    def _decode_around(
-        self, image: np.ndarray, quad: np.ndarray
-    ) -> tuple[list[tuple[int, np.ndarray]], list[np.ndarray]]:
-        """Run `_decode` on an enlarged region around the prediction of a small marker."""
-        if mean_side_px(quad) > _ENLARGE_UP_TO_PX:
-            return [], []
-        return self._decode_region(image, quad, _SEARCH_SIDES * mean_side_px(quad) + _SEARCH_PX)
 
     def _decode_region(
         self, image: np.ndarray, quad: np.ndarray, margin_px: float
@@ -174,24 +167,19 @@ def _worth_a_look(quads: list[np.ndarray]) -> list[np.ndarray]:
     sides_px = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
     centers = corners.mean(axis=1)
     smallest, largest = _CLOSER_LOOK_PX
+    left = np.flatnonzero((sides_px >= smallest) & (sides_px <= largest))
     kept: list[np.ndarray] = []
-    # In squares of `_SAME_PLACE_PX`, centres nearer than that are in the same or the next one.
-    places: dict[tuple[int, int], list[np.ndarray]] = {}
-    for index in np.flatnonzero((sides_px >= smallest) & (sides_px <= largest)):
-        center = centers[index]
-        column, row = (int(value) for value in np.floor(center / _SAME_PLACE_PX))
-        near = (
-            other
-            for x in (column - 1, column, column + 1)
-            for y in (row - 1, row, row + 1)
-            for other in places.get((x, y), ())
-        )
-        if not any(np.max(np.abs(center - other)) < _SAME_PLACE_PX for other in near):
-            kept.append(quads[index])
-            places.setdefault((column, row), []).append(center)
+    while len(left):
+        kept.append(quads[left[0]])
+        apart_px = np.abs(centers[left] - centers[left[0]]).max(axis=1)
+        left = left[apart_px >= _SAME_PLACE_PX]
     return kept
 
 
-def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    apart = np.linalg.norm(a.mean(axis=0) - b.mean(axis=0))
-    return bool(apart < 0.5 * max(mean_side_px(a), mean_side_px(b)))
+def _is_among(quad: np.ndarray, markers: list[tuple[int, np.ndarray]]) -> bool:
+    """Whether one of the markers is where the quadrilateral is."""
+    return any(
+        np.linalg.norm(quad.mean(axis=0) - corners.mean(axis=0))
+        < 0.5 * max(mean_side_px(quad), mean_side_px(corners))
+        for _, corners in markers
+    )

@@ -26,7 +26,7 @@ _KEPT_SHARE = 2  # at most 1/2 of the image is kept; a larger region would hold 
 _WINDOWS_PX, _DARKER, _STRAIGHT = (3, 13, 23), 7, 0.03
 _SAME_PLACE_PX = 3.0
 # At half the size, dark spots from noise vanish, the least outline is that of 3 x 3 pixels, and a
-# square's may be off by a pixel; sides and areas tell it from the spots of a carpet or of plaster.
+# square's may be off by a pixel; sides and areas distinguish it from the spots of a carpet.
 _HALF_WINDOW_PX, _SPECK, _OUTLINE_PX = 11, np.ones((2, 2), np.uint8), 8
 _HALF_STRAIGHT, _HALF_OFF_PX, _AREA_OFF, _LEAST_SIDES = 0.05, 1.0, 0.25, 0.35
 _HALF_SHARE = 0.75  # of a crowd's squares, so many are seen at half the size at least

@@ -17,7 +17,7 @@ from jaxnav.detection.disturbance import (
     in_one_light,
     more_alike,
 )
-from jaxnav.detection.image_model import tells
+from jaxnav.detection.image_model import is_informative
 from jaxnav.detection.patch_fit import LEAST_PIXELS, PatchFit
 from jaxnav.detection.pattern_fit import bounded_loss
 
@@ -111,7 +111,7 @@ def _sorted_by_light(
 ) -> tuple[Bool[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     """Which pixels are lit, and how far each is off in its light, in standard deviations."""
     bright = levels - seen.lit
-    bright = np.where(tells(bright, levels), bright / seen.deviation, 0)
+    bright = np.where(is_informative(bright, levels), bright / seen.deviation, 0)
     dim = find_shade(levels, seen, clear_pixels(pixels_px, bright))
     if dim is None:
         return np.ones(len(bright), bool), bright

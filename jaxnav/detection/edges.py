@@ -4,7 +4,7 @@ The pattern of a decoded marker is known: a black frame with known cells inside,
 The fit finds the four edges (eight numbers, the homography between rays and paper) for which the
 blurred pattern explains the pixels best. Fitting them to pixels rather than to points found along
 normals needs no resampling, keeps the noise of the samples independent, so that the covariance of
-the fit is honest, and tells an edge from the cells one or two pixels behind it.
+the fit is right, and distinguishes an edge from the cells one or two pixels behind it.
 
     I(u) = white - contrast * dark + c1 x + c2 y + c3 far + c4 dark (1 - dark)
     (x, y, 1) ~ M ray(u)
@@ -35,8 +35,8 @@ from jaxnav.detection.image_model import (
     box_split,
     cell_disagreement,
     ink,
+    is_informative,
     ridged,
-    tells,
 )
 from jaxnav.detection.paper import SQUARE, blur_on_paper, generators, on_paper
 from jaxnav.files.executables import kept
@@ -46,7 +46,7 @@ _STEPS = 20
 _START_BLUR_PX2 = 0.8**2
 _BLUR_LIMITS_PX2 = (0.0, 5.0**2)
 _HUBER = 2.5  # standard deviations
-_UNTOLD = 1e-3  # weight of a pixel that does not tell: with none the light may be unknown
+_UNINFORMATIVE = 1e-3  # weight of such a pixel: with none the light may be unknown
 # Prior of the far ground for views without it, and of the curve of the levels: within about a
 # hundred grey levels.
 _PRIOR = 1e-3
@@ -116,13 +116,16 @@ def fit_edges(
     one = jnp.ones((), levels.dtype)
     blur = jnp.array([1.0, 0.0, 1.0], levels.dtype) * _START_BLUR_PX2
     M = jnp.eye(3, dtype=levels.dtype)
-    weight = used * one
-    residual, J, contrast = _linearise(M, blur, patch, weight)
-    hessian, gradient = _normal_equations(residual, J, weight)
-    start = _State(
-        M, blur, residual, J, hessian, gradient,
-        _rms(residual, weight), contrast, 1e-3 * one, jnp.array(0), jnp.array(False), one,
-    )  # fmt: skip
+
+    def state(
+        M: Array, blur: Array, weight: Array, damping: Array, steps: Array, size: Array
+    ) -> _State:
+        residual, J, contrast = _linearise(M, blur, patch, weight)
+        weighted, scale = J * weight[None], _rms(residual, weight)
+        return _State(
+            M, blur, residual, J, weighted @ J.T, weighted @ residual, scale, contrast,
+            damping, steps, jnp.array(False), size,
+        )  # fmt: skip
 
     def attempt(s: _State) -> _State:
         diagonal = jnp.diagonal(s.hessian)
@@ -130,23 +133,19 @@ def fit_edges(
         step = eliminate(s.hessian + ridge, s.gradient[:, None])[:, 0]
         size = jnp.max(jnp.abs(_CORNER_MOTION @ step[:8]))
         step = step * jnp.minimum(1, _MAX_STEP / jnp.maximum(size, 1e-9))
-        M, blur = _moved(s.M, s.blur, step)
         weight = used * _weight(s.residual, s.scale, levels)
-        residual, J, contrast = _linearise(M, blur, patch, weight)
-        hessian, gradient = _normal_equations(residual, J, weight)
+        less = jnp.maximum(s.damping * 0.1, 1e-6)
+        moved = state(*_moved(s.M, s.blur, step), weight, less, s.steps + 1, size)
         before, after = (
-            _loss(r / s.scale, used & tells(r, levels)) for r in (s.residual, residual)
+            _loss(r / s.scale, used & is_informative(r, levels))
+            for r in (s.residual, moved.residual)
         )
-        better = after <= before
-        scale = _rms(residual, weight)
         small = (size < _CONVERGED) | (jnp.abs(before - after) < _PLATEAU * before)
-        moved = _State(
-            M, blur, residual, J, hessian, gradient, scale, contrast,
-            jnp.maximum(s.damping * 0.1, 1e-6), s.steps + 1, small, size,
-        )  # fmt: skip
-        stayed = s._replace(damping=s.damping * 10, steps=s.steps + 1, converged=small, step=size)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), moved, stayed)
+        stayed = s._replace(damping=s.damping * 10, steps=s.steps + 1, step=size)
+        ended = jax.tree.map(lambda a, b: jnp.where(after <= before, a, b), moved, stayed)
+        return ended._replace(converged=small)
 
+    start = state(M, blur, used * one, 1e-3 * one, jnp.array(0), one)
     s = jax.lax.while_loop(lambda s: (s.steps < _STEPS) & ~s.converged, attempt, start)
     weight = used * _weight(s.residual, s.scale, levels)
     freedom = jnp.maximum(jnp.sum(weight) - 16, 1)
@@ -157,7 +156,7 @@ def fit_edges(
     ratio = cell_disagreement(xy, scores, s.hessian, patch.K.shape[0] - 1)
     factor = jnp.where(ratio > _NOTICED, ratio, 1)
     covariance = eliminate(ridged(s.hessian), units)[:8, :8] * noise**2 * factor
-    residual = jnp.where(tells(s.residual, levels), s.residual, 0)
+    residual = jnp.where(is_informative(s.residual, levels), s.residual, 0)
     return EdgeFit(s.M, s.blur, covariance, noise, s.contrast, residual, s.converged, s.step)
 
 
@@ -207,11 +206,6 @@ def _lit(light: Array, weight: Array, levels: Array) -> tuple[Array, Callable[[A
     return solve(weighted @ levels), solve
 
 
-def _normal_equations(residual: Array, J: Array, weight: Array) -> tuple[Array, Array]:
-    weighted = J * weight[None]
-    return weighted @ J.T, weighted @ residual
-
-
 def _moved(M: Array, blur: Array, step: Array) -> tuple[Array, Array]:
     D = jnp.append(step[:8], 0).reshape(3, 3)
     xx, xy, yy = blur + step[8:]
@@ -229,9 +223,9 @@ def _rms(residual: Array, weight: Array) -> Array:
 
 
 def _weight(residual: Array, scale: Array, levels: Array) -> Array:
-    """Huber's, and next to none of a pixel that does not tell of the model."""
+    """Huber's, and next to none of a pixel that says nothing of the model."""
     huber = _HUBER / jnp.maximum(jnp.abs(residual / scale), _HUBER)
-    return jnp.where(tells(residual, levels), huber, _UNTOLD)
+    return jnp.where(is_informative(residual, levels), huber, _UNINFORMATIVE)
 
 
 def _loss(r: Array, used: Array) -> Array:

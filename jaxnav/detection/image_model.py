@@ -7,7 +7,7 @@
 pattern), Phi2 the integral of the blur on the paper. The blur's covariance is G (S + I/12) G' with
 G = d(x, y)/du, S that of the lens (px^2), 1/12 that of a square pixel, whose flat top is kept. A
 marker that moves during the exposure shows the mean of its images at instants t_j, evenly over it,
-each blurred by the motion between two of them. A pixel that is full, or empty, tells only that
+each blurred by the motion between two of them. A pixel that is full, or empty, says only that
 there is no less light, or no more.
 
 Source: Tobin (1958), censored observations.
@@ -212,9 +212,9 @@ def gauss(z: Array) -> tuple[Array, Array]:
     return jnp.where(z < 0, upper, 1 - upper), exponential * (1 / math.sqrt(2 * math.pi))
 
 
-def tells(residual: Any, levels: Any) -> Any:
-    """Whether a pixel's residual tells of the model: that of a full one only if the model has less
-    light, that of an empty one only if it has more. Takes NumPy's and JAX's arrays.
+def is_informative(residual: Any, levels: Any) -> Any:
+    """Whether a pixel's residual says something of the model: that of a full one only if the model
+    has less light, that of an empty one only if it has more. Takes NumPy's and JAX's arrays.
     """
     return ((levels < _FULL) | (residual > 0)) & ((levels > _EMPTY) | (residual < 0))
 

@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.detection import Detections, make_detectors
@@ -19,9 +18,8 @@ class ImageSearch:
         Raises:
             BadInput: as `make_detector`.
         """
-        self._rig = rig
         self._detectors = make_detectors(markers, corner_backend)
-        self._lenses: dict[int, Camera] = {}
+        self._cameras = [rig.camera(camera) for camera in range(len(rig))]
 
     def detections(
         self, camera: int, image: UInt8[np.ndarray, "rows columns *channels"]
@@ -32,18 +30,14 @@ class ImageSearch:
             camera: index in the rig.
             image: (H, W) or (H, W, 3) in BGR order, uint8, of the rig's size.
         """
-        if camera not in self._lenses:
-            self._lenses[camera] = self._rig.camera(camera)
-        lens = self._lenses[camera]
-        return Detections.concatenate(
-            [detector.detect(image, lens) for detector in self._detectors]
-        )
+        lens = self._cameras[camera]
+        return Detections.concatenate([one.detect(image, lens) for one in self._detectors])
 
 
 def size_problem(
     rig: CameraRig, camera: int, image: UInt8[np.ndarray, "rows columns *channels"]
 ) -> str | None:
-    """Say in words how the image's size differs from the camera's; None if it doesn't."""
+    """How the image's size differs from the camera's; None if it doesn't."""
     height, width = image.shape[:2]
     expected = rig.image_sizes_px[camera]
     if (width, height) == expected:

@@ -43,7 +43,7 @@ def marker_keys(markers: MarkerMap) -> tuple[tuple[str, int], ...]:
 def double_area_px2(corners_px: Float[np.ndarray, "*N 4 2"]) -> Float[np.ndarray, "*N"]:
     """Twice the area that corners TL TR BR BL go round, px^2: the product of the diagonals.
 
-    It is positive for whoever sees the print, whatever lens and roll the camera has: on the screen,
+    It is positive for a marker seen from the front, by any lens and roll: on the screen,
     whose y axis points down, these corners run clockwise. It is negative where a detector lists
     them the other way round.
     """
@@ -76,8 +76,8 @@ def observe(detections: Sequence[Detections], markers: MarkerMap) -> CornerLanes
 
     A marker found at two places in one image is dropped: the map has it once, so one of the two
     is a copy or a reflection, and nothing in the image says which. A marker reported twice at the
-    same place is kept once. Whoever sees a marker's print sees its corners run clockwise: those
-    that run the other way round are in another order than ours, and dropped.
+    same place is kept once. From the front a marker's corners run clockwise: those that run the
+    other way round are in another order than ours, and dropped.
     """
     # The map's own method would be slower: equinox wraps it in a module at every call, 0.1 ms.
     lanes = {key: lane for lane, key in enumerate(zip(markers.ids, markers.families, strict=True))}

@@ -11,11 +11,10 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from jaxnav.core.models.camera import Camera
-from jaxnav.detection.codes import codes_on_device
 from jaxnav.detection.families import marker_cells
 from jaxnav.detection.image_model import step_corners
-from jaxnav.detection.pattern_model import Unknowns
-from jaxnav.detection.pattern_program import Patch, follow_pattern
+from jaxnav.detection.pattern_model import Patch, Unknowns
+from jaxnav.detection.pattern_program import codes_on_device, follow_pattern
 from jaxnav.detection.refine import mean_side_px, pixels_along, scattered
 from jaxnav.detection.signs_of_life import sign
 

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxnav.core.linalg.levenberg_marquardt import Move, NielsenLM, NormalEquations
 from jaxnav.core.linalg.small_matrices import eliminate
-from jaxnav.detection.image_model import Exposure, cell_disagreement, ridged, tells
+from jaxnav.detection.image_model import Exposure, cell_disagreement, is_informative, ridged
 from jaxnav.detection.paper import on_paper
 from jaxnav.detection.pattern_model import (
     BEND,
@@ -30,7 +30,6 @@ from jaxnav.detection.pattern_model import (
     Window,
     basis_of,
     first_light,
-    first_pixels,
     model,
     prior_of,
 )
@@ -40,7 +39,7 @@ _WIDTH = 3.0  # of the loss, standard deviations
 # and E[psi^2] / E[w] over E[w r^2] / E[w].
 _SLOPE, _SCORE = 0.734, 0.682
 _NOTICED = 1.37  # a smaller factor may come from so many cells by chance
-_FAR = 0.2  # of a pixel's light from the ground: what shows more of it tells nothing of the noise
+_FAR = 0.2  # of a pixel's light from the ground: what shows more of it says nothing of the noise
 _LEAST_NOISE = 0.7  # grey levels: rounding and a quiet sensor
 _STEPS = 8
 _COARSE_STEPS = 6
@@ -49,25 +48,30 @@ _MOST_LENS_PX2 = 9.0
 _MOST_STEP = 0.15  # of D: half sides
 
 
+class PixelFit(NamedTuple):
+    """What a fit says of each pixel."""
+
+    xy: Float[Array, "2 N"]  # places on the paper
+    residual: Float[Array, " N"]  # grey levels
+    deviation: Float[Array, " N"]  # standard deviation, grey levels
+    dark: Float[Array, " N"]  # share of its light that ink takes
+    darkens: Float[Array, " N"]  # by how many levels ink darkens it
+    lit: Float[Array, " N"]  # its level without the shadow
+    ink: Float[Array, " N"]  # what of that comes from ink
+
+
 class PatternFit(NamedTuple):
     """The result of a fit, in paper coordinates."""
 
     y: Unknowns
-    xy: Float[Array, "2 N"]  # places of the pixels on the paper
+    pixels: PixelFit
     covariance: Float[Array, "8 8"]  # of D in (I + D) M, by rows without the last entry
     noise: Float[Array, ""]  # standard deviation of the pixels that fit, grey levels
     weight: Float[Array, " N"]  # of each pixel in the loss, 0 to 1; 0 for padding
-    residual: Float[Array, " N"]  # grey levels
-    dark: Float[Array, " N"]  # share of each pixel's light that ink takes
     white: Float[Array, " N"]  # levels as they would be without ink
-    darkens: Float[Array, " N"]  # by how many levels ink darkens a pixel
-    lit: Float[Array, " N"]  # levels without the shadow
-    ink: Float[Array, " N"]  # what of them comes from ink
     bend: Float[Array, ""]  # of levels that are half dark, grey levels
-    deviation: Float[Array, " N"]  # standard deviation of a pixel, grey levels
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
-    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
 
 
 class _PatternLM(NielsenLM):
@@ -99,56 +103,45 @@ class _PatternLM(NielsenLM):
         )
 
 
-def fit_pattern(
-    window: Window, instants: Int[Array, ""], start: Unknowns | None = None
-) -> PatternFit:
+def fit_pattern(window: Window, start: Unknowns | None = None) -> PatternFit:
     """Fit a window.
 
     Args:
-        instants: number of images that are averaged, see `expose`.
         start: where the steps begin, near the end; None: at M = I and the expected motion, which
             may be a pixel off, so that a wide loss comes first.
     """
-    y = _nearer(window, (instants + 1) // 2) if start is None else start
-    residual, _, image = model(y, window, instants)
+    y = _nearer(window) if start is None else start
+    residual, _, image = model(y, window)
     noise = _noise(residual, image, window)
-    y = _minimum(y, window, _deviation(noise, image, window), instants, _STEPS, _SLOPE)
-    return _result(y, window, instants)
+    y = _minimum(y, window, _deviation(noise, image, window), _STEPS, _SLOPE)
+    return _result(y, window)
 
 
-def _nearer(window: Window, instants: Int[Array, ""]) -> Unknowns:
-    """The least of a loss as wide as the contrast, over a part of the pixels."""
-    dtype = window.levels.dtype
-    few = first_pixels(window, window.levels.shape[0] // _COARSER)
-    y = Unknowns(
-        jnp.eye(3, dtype=dtype),
-        window.motion_px,
-        jnp.asarray(LENS_PX2, dtype),
-        jnp.zeros(LIGHTS, dtype),
-    )
-    y = y._replace(light=first_light(y, few, instants))
-    scale = window.most_noise * jnp.ones_like(few.levels)
-    return _minimum(y, few, scale, instants, _COARSE_STEPS)
+def _nearer(window: Window) -> Unknowns:
+    """The least of a loss as wide as the contrast, over a part of the pixels and instants."""
+    patch, dtype = window.patch, window.patch.levels.dtype
+    few = window.first(patch.levels.shape[0] // _COARSER)
+    few = few._replace(patch=few.patch._replace(instants=(patch.instants + 1) // 2))
+    lens_px2, light = jnp.asarray(LENS_PX2, dtype), jnp.zeros(LIGHTS, dtype)
+    y = Unknowns(jnp.eye(3, dtype=dtype), patch.motion_px, lens_px2, light)
+    y = y._replace(light=first_light(y, few))
+    return _minimum(y, few, patch.most_noise * jnp.ones_like(few.patch.levels), _COARSE_STEPS)
 
 
 def _noise(residual: Array, image: Exposure, window: Window) -> Array:
     """Standard deviation of the pixels that fit, of those that show little of the ground."""
-    plain = window.used & (image.far < _FAR) & tells(residual, window.levels)
-    return jnp.maximum(_spread(residual, plain, window.most_noise), _LEAST_NOISE)
+    patch = window.patch
+    plain = patch.used & (image.far < _FAR) & is_informative(residual, patch.levels)
+    return jnp.maximum(_spread(residual, plain, patch.most_noise), _LEAST_NOISE)
 
 
 def _deviation(noise: Array, image: Exposure, window: Window) -> Float[Array, " N"]:
     """Standard deviation of each pixel: its noise, and the ground's where that shows."""
-    return jnp.sqrt(noise**2 + (window.ground * window.contrast * image.far) ** 2)
+    return jnp.sqrt(noise**2 + (window.patch.ground * window.patch.contrast * image.far) ** 2)
 
 
 def _minimum(
-    y: Unknowns,
-    window: Window,
-    scale: Float[Array, " N"],
-    instants: Int[Array, ""],
-    steps: int,
-    slope: float = 1.0,
+    y: Unknowns, window: Window, scale: Float[Array, " N"], steps: int, slope: float = 1.0
 ) -> Unknowns:
     """The unknowns at the least loss.
 
@@ -159,8 +152,8 @@ def _minimum(
 
     def cost(y: Any, args: Any) -> tuple[Any, Any]:
         del args
-        residual, J, _ = model(y, window, instants)
-        loss, weight = _loss(residual / scale, window.used)
+        residual, J, _ = model(y, window)
+        loss, weight = _loss(residual / scale, window.patch.used)
         weighted = J * (weight / scale**2)[None]
         prior, prior_J = prior_of(y, window)
         return jnp.concatenate([jnp.sqrt(loss), prior]), NormalEquations(
@@ -203,11 +196,12 @@ def _spread(residual: Array, used: Array, most: Array) -> Array:
     return jnp.where(jnp.isfinite(spread), spread, most)
 
 
-def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit:
-    residual, J, image = model(y, window, instants)
+def _result(y: Unknowns, window: Window) -> PatternFit:
+    residual, J, image = model(y, window)
+    patch = window.patch
     noise = _noise(residual, image, window)
     scale = _deviation(noise, image, window)
-    _, weight = _loss(residual / scale, window.used)
+    _, weight = _loss(residual / scale, patch.used)
     _, prior_J = prior_of(y, window)
     prior = prior_J.T @ prior_J
     weighted = J * (weight / scale**2)[None]
@@ -220,12 +214,12 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     scores = weighted * (residual / jnp.maximum(1 - leverage, 0.3))[None]
     covariance = bread @ (scores @ scores.T + prior) @ bread
     xy, _ = on_paper(y.M, window.rays, window.rays_px)
-    told = jnp.where(tells(residual, window.levels), weight, 0)
-    variance = jnp.sum(told * (residual / scale) ** 2) / jnp.maximum(jnp.sum(told), 1)
+    counts = jnp.where(is_informative(residual, patch.levels), weight, 0)
+    variance = jnp.sum(counts * (residual / scale) ** 2) / jnp.maximum(jnp.sum(counts), 1)
     score = weighted * residual[None] / jnp.sqrt(_SCORE * variance)
-    ratio = cell_disagreement(xy, score, information, window.K.shape[0] - 1)
+    ratio = cell_disagreement(xy, score, information, patch.K.shape[0] - 1)
     covariance = covariance * jnp.where(ratio > _NOTICED, ratio, 1)
-    basis, light = basis_of(y, window, image), y.light * window.contrast
+    basis, light = basis_of(y, window, image), y.light * patch.contrast
     bright = basis_of(y, window, image._replace(dark=jnp.zeros_like(image.dark)))
     inky = basis_of(y, window, image._replace(dark=jnp.ones_like(image.dark)))
     white = light @ bright
@@ -233,24 +227,24 @@ def _result(y: Unknowns, window: Window, instants: Int[Array, ""]) -> PatternFit
     in_light = light.at[SHADES].set(0)
     ink = image.dark * (in_light @ inky)
     plain = _plain(basis[:3], window, scale)
-    without, with_marker = (jnp.sum(_loss(r / scale, window.used)[0]) for r in (plain, residual))
+    without, with_marker = (jnp.sum(_loss(r / scale, patch.used)[0]) for r in (plain, residual))
+    pixels = PixelFit(xy, residual, scale, image.dark, darkens, in_light @ basis, ink)
     return PatternFit(
-        y, xy, covariance[:8, :8], noise, weight, residual, image.dark, white,
-        darkens, in_light @ basis, ink, light[BEND], scale, ratio, 1 - with_marker / without,
-        (without - with_marker) / 2,
+        y, pixels, covariance[:8, :8], noise, weight, white, light[BEND], ratio,
+        1 - with_marker / without,
     )  # fmt: skip
 
 
 def _plain(basis: Float[Array, "3 N"], window: Window, scale: Array) -> Float[Array, " N"]:
     """Residual (N,) of a ground without a marker: a level and its gradient."""
-    weight = window.real / scale**2
+    real, levels = window.patch.real, window.patch.levels
+    weight = real / scale**2
     level = jnp.zeros(3, basis.dtype)
     for _ in range(3):
         weighted = basis * weight[None]
         gram = weighted @ basis.T
-        level = eliminate(
-            gram + 1e-6 * jnp.trace(gram) * jnp.eye(3), (weighted @ window.levels)[:, None]
-        )[:, 0]
-        residual = window.levels - level @ basis
-        weight = _loss(residual / scale, window.real)[1] / scale**2
+        gram = gram + 1e-6 * jnp.trace(gram) * jnp.eye(3)
+        level = eliminate(gram, (weighted @ levels)[:, None])[:, 0]
+        residual = levels - level @ basis
+        weight = _loss(residual / scale, real)[1] / scale**2
     return residual

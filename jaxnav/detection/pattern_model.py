@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.core.linalg.small_matrices import eliminate
-from jaxnav.detection.image_model import Exposure, expose, tells
+from jaxnav.detection.image_model import Exposure, expose, is_informative
 from jaxnav.detection.paper import on_paper
 
 LIGHTS = 10
@@ -24,24 +24,36 @@ LENS_PX2, _LENS_SIGMA_PX2 = 0.4, 0.5
 _LIGHT_SIGMA = (10.0, 0.5, 0.5, 10.0, 0.2, 0.2, 1.0, 0.3, 2.0, 0.6)
 
 
-class Window(NamedTuple):
-    """The pixels around one marker's predicted place, and what is expected there.
+class Patch(NamedTuple):
+    """The pixels around one marker's predicted place, padded to N, and what is expected there."""
 
-    M is the first guess in a basis in which it is near the identity; rays are in that basis.
-    """
-
-    rays: Float[Array, "3 N"]
-    rays_px: Float[Array, "2 3 N"]
+    pixels: Float[Array, "N 2"]
     levels: Float[Array, " N"]
     real: Bool[Array, " N"]  # which pixels are no padding
     used: Bool[Array, " N"]  # which of them count in the fit
-    K: Float[Array, "k k"]
     shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
+    quad_px: Float[Array, "4 2"]  # about where the corners are
+    K: Float[Array, "k k"]  # `step_corners` of the marker
+    own: Int[Array, ""]  # which of the family's codes it is
     motion_px: Float[Array, " 2"]  # the expected streak
     motion_sigma_px: Float[Array, ""]
     contrast: Float[Array, ""]  # about that of the marker, grey levels
     ground: Float[Array, ""]  # standard deviation of the ground beyond the paper, of the contrast
     most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
+    instants: Int[Array, ""]  # see `expose`
+
+
+class Window(NamedTuple):
+    """A patch and the rays through its pixels, in a basis in which M is near the identity."""
+
+    rays: Float[Array, "3 N"]
+    rays_px: Float[Array, "2 3 N"]
+    patch: Patch
+
+    def first(self, count: int) -> "Window":
+        """The window with its first pixels alone."""
+        few = {name: getattr(self.patch, name)[:count] for name in ("levels", "used", "shadow")}
+        return Window(self.rays[:, :count], self.rays_px[:, :, :count], self.patch._replace(**few))
 
 
 class Unknowns(NamedTuple):
@@ -51,37 +63,31 @@ class Unknowns(NamedTuple):
     light: Float[Array, " L"]  # over the contrast
 
 
-def first_pixels(window: Window, count: int) -> Window:
-    """The window with its first pixels alone."""
-    return window._replace(
-        rays=window.rays[:, :count],
-        rays_px=window.rays_px[:, :, :count],
-        levels=window.levels[:count],
-        real=window.real[:count],
-        used=window.used[:count],
-        shadow=window.shadow[:count],
+def exposure(y: Unknowns, window: Window) -> Exposure:
+    """The image of the ink."""
+    patch = window.patch
+    return expose(
+        y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, patch.K, patch.instants
     )
 
 
-def model(
-    y: Unknowns, window: Window, instants: Int[Array, ""]
-) -> tuple[Float[Array, " N"], Float[Array, "n N"], Exposure]:
+def model(y: Unknowns, window: Window) -> tuple[Float[Array, " N"], Float[Array, "n N"], Exposure]:
     """Residual (N,), slopes (n, N) of the model by all unknowns, and the ink's image."""
-    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
+    image, patch = exposure(y, window), window.patch
     basis = basis_of(y, window, image)
-    light = y.light * window.contrast
+    light = y.light * patch.contrast
     levels = light @ basis
     x, y_paper = on_paper(y.M, window.rays, window.rays_px)[0]
     contrast = light[3] + light[4] * x + light[5] * y_paper
     by_dark = light[BEND] * (1 - 2 * image.dark) - contrast
-    by_dark = by_dark + (light[6] - light[7]) * (1 - window.shadow)
+    by_dark = by_dark + (light[6] - light[7]) * (1 - patch.shadow)
     J = jnp.concatenate(
         [by_dark[None] * image.by_D, by_dark[None] * image.by_motion,
-         (by_dark * image.by_lens)[None], window.contrast * basis]
+         (by_dark * image.by_lens)[None], patch.contrast * basis]
     )  # fmt: skip
-    residual = window.levels - levels
-    told = tells(residual, window.levels)
-    return jnp.where(told, residual, 0), jnp.where(told[None], J, 0), image
+    residual = patch.levels - levels
+    known = is_informative(residual, patch.levels)
+    return jnp.where(known, residual, 0), jnp.where(known[None], J, 0), image
 
 
 def basis_of(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"]:
@@ -90,27 +96,28 @@ def basis_of(y: Unknowns, window: Window, image: Exposure) -> Float[Array, "L N"
     # Beyond the marker gradients end: the ground there has its own light.
     x, y_paper = jnp.clip(x, -1.5, 1.5), jnp.clip(y_paper, -1.5, 1.5)
     dark = image.dark
-    shade = window.shadow - 1
+    shade = window.patch.shadow - 1
     return jnp.stack(
         [jnp.ones_like(x), x, y_paper, -dark, -dark * x, -dark * y_paper, shade * (1 - dark),
          shade * dark, image.far, dark * (1 - dark)]
     )  # fmt: skip
 
 
-def first_light(y: Unknowns, window: Window, instants: Int[Array, ""]) -> Float[Array, " L"]:
+def first_light(y: Unknowns, window: Window) -> Float[Array, " L"]:
     """The light that suits all else, by least squares."""
-    image = expose(y.M, y.motion_px, y.lens_px2, window.rays, window.rays_px, window.K, instants)
-    basis = basis_of(y, window, image)
-    weighted = basis * window.used[None]
+    patch = window.patch
+    basis = basis_of(y, window, exposure(y, window))
+    weighted = basis * patch.used[None]
     prior = jnp.asarray([1 / s**2 for s in _LIGHT_SIGMA], basis.dtype)
     gram = weighted @ basis.T + jnp.diag(prior)
-    return eliminate(gram, (weighted @ window.levels / window.contrast)[:, None])[:, 0]
+    return eliminate(gram, (weighted @ patch.levels / patch.contrast)[:, None])[:, 0]
 
 
 def prior_of(y: Unknowns, window: Window) -> tuple[Float[Array, " p"], Float[Array, "p n"]]:
     """What is expected of motion, lens and light, in standard deviations, and its slopes."""
-    sigmas = jnp.asarray([_LENS_SIGMA_PX2, *_LIGHT_SIGMA], y.light.dtype)
-    sigmas = jnp.concatenate([jnp.full(2, 1, y.light.dtype) * window.motion_sigma_px, sigmas])
-    off = jnp.concatenate([y.motion_px - window.motion_px, (y.lens_px2 - LENS_PX2)[None], y.light])
+    patch, dtype = window.patch, y.light.dtype
+    sigmas = jnp.asarray([_LENS_SIGMA_PX2, *_LIGHT_SIGMA], dtype)
+    sigmas = jnp.concatenate([jnp.full(2, 1, dtype) * patch.motion_sigma_px, sigmas])
+    off = jnp.concatenate([y.motion_px - patch.motion_px, (y.lens_px2 - LENS_PX2)[None], y.light])
     slopes = jnp.eye(UNKNOWNS, dtype=y.light.dtype)[8:] / sigmas[:, None]
     return off / sigmas, slopes

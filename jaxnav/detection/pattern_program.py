@@ -4,45 +4,32 @@ One call for everything, from the rays through the pixels to the comparison with
 array that crosses between NumPy and JAX, and each call, takes tens of microseconds.
 """
 
+from functools import cache
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Float
 
 from jaxnav.core.models.camera import Camera
-from jaxnav.detection.codes import code_advantage
 from jaxnav.detection.disturbance import noise_correlation
-from jaxnav.detection.image_model import tells
+from jaxnav.detection.families import codes_of
+from jaxnav.detection.image_model import cell_shares, is_informative
 from jaxnav.detection.lens import pixels_of, rays_through
 from jaxnav.detection.paper import SQUARE, corner_motion, homography, on_paper, rays_of
-from jaxnav.detection.pattern_fit import fit_pattern
-from jaxnav.detection.pattern_model import Unknowns, Window
+from jaxnav.detection.pattern_fit import PatternFit, PixelFit, bounded_loss, fit_pattern
+from jaxnav.detection.pattern_model import Patch, Unknowns, Window
 from jaxnav.files.executables import kept
 
+_NODES = 4  # images of a moving marker that are averaged to compare codes, at most
+_NEAR = 96  # codes that are drawn
+_MOST = 10.0  # standard deviations, of a pixel that helps to choose them
 _ZONE = 1.1  # cells around the marker that count: its white zone is one wide
 
 
-class Patch(NamedTuple):
-    """The pixels around one marker's predicted place, padded to N, and what is expected there."""
-
-    pixels: Float[Array, "N 2"]
-    levels: Float[Array, " N"]
-    real: Bool[Array, " N"]  # which pixels are no padding
-    used: Bool[Array, " N"]  # which of them count in the fit
-    shadow: Float[Array, " N"]  # 1 in the light, 0 in the shadow
-    quad_px: Float[Array, "4 2"]  # about where the corners are
-    K: Float[Array, "k k"]  # `step_corners` of the marker
-    own: Int[Array, ""]  # which of the family's codes it is
-    motion_px: Float[Array, " 2"]  # the expected streak
-    motion_sigma_px: Float[Array, ""]
-    contrast: Float[Array, ""]  # about that of the marker, grey levels
-    ground: Float[Array, ""]  # standard deviation of the ground beyond the paper, of the contrast
-    most_noise: Float[Array, ""]  # standard deviation of pixels that fit, at most
-    instants: Int[Array, ""]  # see `expose`
-
-
 class Summary(NamedTuple):
-    """What a fit tells of its marker."""
+    """What a fit says of its marker."""
 
     corners_px: Float[Array, "4 2"]
     covariance_px2: Float[Array, "8 8"]  # of the corners, u and v of each in turn
@@ -52,21 +39,8 @@ class Summary(NamedTuple):
     weight: Float[Array, ""]  # mean weight of the pixels that count, 0 to 1
     disagreement: Float[Array, ""]  # of the cells: 1 where residuals are noise
     explained: Float[Array, ""]  # part of the loss without a marker, 0 to 1
-    log_likelihood_ratio: Float[Array, ""]  # of the marker against a plain ground
     advantage: Float[Array, ""]  # noise variances by which the nearest other code is worse
     alike: Float[Array, ""]  # factor of the variances by which neighbours' noise is alike
-
-
-class PixelFit(NamedTuple):
-    """What a fit tells of each pixel."""
-
-    xy: Float[Array, "2 N"]  # places on the paper
-    residual: Float[Array, " N"]  # grey levels
-    deviation: Float[Array, " N"]  # standard deviation, grey levels
-    dark: Float[Array, " N"]  # share of its light that ink takes
-    darkens: Float[Array, " N"]  # by how many levels ink darkens it
-    lit: Float[Array, " N"]  # its level without the shadow
-    ink: Float[Array, " N"]  # what of that comes from ink
 
 
 class Followed(NamedTuple):
@@ -75,6 +49,12 @@ class Followed(NamedTuple):
     summary: Summary
     pixels: PixelFit
     unknowns: Unknowns
+
+
+@cache
+def codes_on_device(family: str) -> Float[Array, "codes cells"]:
+    """`codes_of` as an array of JAX, float32."""
+    return jnp.asarray(codes_of(family), jnp.float32)
 
 
 @kept
@@ -97,33 +77,78 @@ def follow_pattern(
     rays, rays_px = (M0 @ rays).astype(f32), (M0[None] @ rays_px).astype(f32)
     zone = 1 + 2 * _ZONE / (patch.K.shape[0] - 1)
     near = jnp.all(jnp.abs(on_paper(jnp.eye(3, dtype=f32), rays, rays_px)[0]) < zone, axis=0)
-    window = Window(
-        rays, rays_px, patch.levels, patch.real & near, patch.used & near, patch.K, patch.shadow,
-        patch.motion_px, patch.motion_sigma_px, patch.contrast, patch.ground, patch.most_noise,
-    )  # fmt: skip
-    fit = fit_pattern(window, patch.instants, start)
+    patch = patch._replace(real=patch.real & near, used=patch.used & near)
+    window = Window(rays, rays_px, patch)
+    fit = fit_pattern(window, start)
+    pixels = fit.pixels
     M = fit.y.M.astype(M0.dtype) @ M0
     corners_px = pixels_of(camera, rays_of(M, SQUARE))
     motion = corner_motion(M, *rays_through(camera, corners_px)).astype(f32)
     # Where the ground beyond the paper shows, residuals are alike, and count little in the fit.
-    plain = (fit.weight > 0.5) & tells(fit.residual, patch.levels)
-    share = jnp.where(plain, fit.noise / fit.deviation, 0)
-    alike = noise_correlation(patch.pixels, fit.residual / fit.deviation, share)
+    plain = (fit.weight > 0.5) & is_informative(pixels.residual, patch.levels)
+    share = jnp.where(plain, fit.noise / pixels.deviation, 0)
+    alike = noise_correlation(patch.pixels, pixels.residual / pixels.deviation, share)
     covariance = motion @ (alike * (fit.covariance + fit.covariance.T) / 2) @ motion.T
     summary = Summary(
         corners_px.astype(f32),
         covariance,
         fit.y.motion_px,
         fit.noise,
-        jnp.sum(fit.weight * fit.darkens) / jnp.maximum(jnp.sum(fit.weight), 1),
-        jnp.sum(fit.weight) / jnp.maximum(jnp.sum(window.used), 1),
+        jnp.sum(fit.weight * pixels.darkens) / jnp.maximum(jnp.sum(fit.weight), 1),
+        jnp.sum(fit.weight) / jnp.maximum(jnp.sum(patch.used), 1),
         fit.disagreement,
         fit.explained,
-        fit.log_likelihood_ratio,
-        code_advantage(fit, window, codes, patch.own, patch.instants),
+        _code_advantage(fit, window, codes),
         alike,
     )
-    pixels = PixelFit(
-        fit.xy, fit.residual, fit.deviation, fit.dark, fit.darkens, fit.lit, fit.ink
-    )  # fmt: skip
     return Followed(summary, pixels, fit.y)
+
+
+def _code_advantage(
+    fit: PatternFit, window: Window, codes: Float[Array, "codes cells"]
+) -> Float[Array, ""]:
+    """By how many noise variances every other code, in any quarter turn, is worse than this one.
+
+    Every code is drawn through the blur, the homography and the light of the fit, and compared with
+    pixels that the fit left out as well: what hides a marker if this code is right may be another
+    code. The loss of a pixel is bounded. Negative if another code is better.
+    """
+    patch, pixels = window.patch, fit.pixels
+    n = patch.K.shape[0] - 1
+    ink = _cell_images(fit.y, window, n)
+    inside = np.pad(np.ones((n - 2, n - 2), bool), 1).ravel()
+    frame, cells = jnp.sum(ink[~inside], axis=0), ink[inside]
+    # By a pixel's own noise: what it would be without ink, and by how much ink darkens it.
+    share = patch.real / pixels.deviation
+    light, darkens, bend = (
+        share * part for part in (patch.levels - fit.white, pixels.darkens, fit.bend)
+    )
+
+    def left(drawn: Array) -> Array:
+        """What so much ink leaves of each pixel's light; 0 where the pixel is not informative."""
+        residual = light + darkens * drawn - bend * drawn * (1 - drawn)
+        return jnp.where(is_informative(residual, patch.levels), residual, 0)
+
+    # To draw all codes would take some milliseconds: those that correlate best suffice, with what
+    # remains between no ink in the cells and ink in all of them.
+    grey = (left(frame) + left(frame + jnp.sum(cells, axis=0))) / 2
+    alike = codes @ (cells @ (darkens * jnp.clip(grey, -_MOST, _MOST)))
+    near = jnp.argsort(alike)[:_NEAR]  # `top_k` calls a library, and such programs can't be kept
+    drawn = frame[None] + jnp.concatenate([codes[near], codes[patch.own][None]]) @ cells
+    losses = jnp.sum(bounded_loss(jax.vmap(left)(drawn))[0], axis=1)
+    return jnp.min(jnp.where(near == patch.own, jnp.inf, losses[:-1])) - losses[-1]
+
+
+def _cell_images(y: Unknowns, window: Window, n: int) -> Float[Array, "cells N"]:
+    """The share of each pixel's light that comes from each cell of a moving marker, (n * n, N)."""
+    rays, rays_px, nodes = window.rays, window.rays_px, jnp.minimum(window.patch.instants, _NODES)
+    between = y.motion_px / nodes
+    S = jnp.stack([between[0] ** 2, between[0] * between[1], between[1] ** 2]) / 12
+    S = S + y.lens_px2 * jnp.asarray([1, 0, 1], S.dtype)
+
+    def add(i: Array, images: Array) -> Array:
+        time = (i + 0.5) / nodes - 0.5
+        shifted = rays - time * (y.motion_px[0] * rays_px[0] + y.motion_px[1] * rays_px[1])
+        return images + cell_shares(y.M, shifted, rays_px, S, n) / nodes
+
+    return jax.lax.fori_loop(0, nodes, add, jnp.zeros((n * n, rays.shape[1]), rays.dtype))

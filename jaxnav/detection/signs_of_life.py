@@ -1,8 +1,8 @@
 """Signs of life of a thread that searches an image: one before each fit of some milliseconds.
 
-A search takes as long as there is much to see, so its length does not tell whether it hangs.
+A search takes as long as there is much to see, so its duration does not show whether it hangs.
 
-    with telling(partial(guard.beat, name)):
+    with watched_by(partial(guard.beat, name)):
         detector.detect(image)
 """
 
@@ -14,8 +14,8 @@ _thread = threading.local()
 
 
 @contextmanager
-def telling(alive: Callable[[], None]) -> Iterator[None]:
-    """Have `sign` call this, inside the block and in this thread."""
+def watched_by(alive: Callable[[], None]) -> Iterator[None]:
+    """Inside the block, and in this thread, `sign` calls `alive`."""
     before, _thread.alive = getattr(_thread, "alive", None), alive
     try:
         yield
@@ -24,7 +24,7 @@ def telling(alive: Callable[[], None]) -> Iterator[None]:
 
 
 def sign() -> None:
-    """Give a sign of life to whoever watches this thread."""
+    """Give a sign of life to the watchdog of this thread."""
     alive = getattr(_thread, "alive", None)
     if alive is not None:
         alive()

@@ -68,7 +68,6 @@ class Track:
         streak_px: (2,), of its centre during the exposure; its sign is the expected one's.
         explained: 0 to 1, the part of the loss without a marker that the marker explains.
         advantage: noise variances by which the nearest other code of the family is worse.
-        log_likelihood_ratio: of this marker against a plain ground.
     """
 
     family: str
@@ -78,7 +77,6 @@ class Track:
     streak_px: Float[np.ndarray, " 2"]
     explained: float
     advantage: float
-    log_likelihood_ratio: float
 
     @property
     def sigma_px(self) -> Float[np.ndarray, " 4"]:
@@ -178,7 +176,9 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
     if not (fit.explained >= _LEAST_EXPLAINED and advantage >= _LEAST_ADVANTAGE):
         return None
     streak_px = np.asarray(fit.streak_px, float)
-    sigma_px = _model_sigma_px(float(np.hypot(*streak_px)), side_px)
+    # What residuals don't show: a streak as long as the marker mixes the ground into all of it.
+    streaks = min(float(np.hypot(*streak_px)) / side_px, 2.0)
+    sigma_px = _MODEL_SIGMA_PX + _STREAK_SIGMA_PX * streaks**4
     covariance = np.asarray(fit.covariance_px2, float) + sigma_px**2 * np.eye(8)
     if not np.all(np.isfinite(covariance)):
         return None
@@ -186,10 +186,5 @@ def _judge(target: Target, patch_fit: PatchFit) -> Track | None:
         streak_px = -streak_px
     return Track(
         target.family, target.marker_id, corners_px, covariance, streak_px,
-        float(fit.explained), float(fit.advantage), float(fit.log_likelihood_ratio),
+        float(fit.explained), float(fit.advantage),
     )  # fmt: skip
-
-
-def _model_sigma_px(streak_px: float, side_px: float) -> float:
-    """What residuals don't show: a streak as long as the marker mixes the ground into all of it."""
-    return _MODEL_SIGMA_PX + _STREAK_SIGMA_PX * min(streak_px / side_px, 2.0) ** 4

@@ -1,11 +1,11 @@
 """Follow the markers of one camera that its decoders do not read, and learn its exposure time.
 
-A decoder has the first word. What the filter expects and no decoder finds is followed by `track`,
-the largest first. A marker's streak is its velocity in the image times the exposure time; where
-nobody says that time, the streaks of the markers that are followed tell it.
+What the filter expects and no decoder finds is followed by `track`, the largest first. A marker's
+streak is its velocity in the image times the exposure time; where that time is not given, it is
+learnt from the streaks of the markers that are followed.
 
 A rolling shutter sees each row at its own time: corners of a marker that moves are taken back to
-the time of the middle row, or are less certain by as much where nobody says how fast it rolls.
+the time of the middle row, or are less certain by as much where its speed is not given.
 """
 
 from collections import deque
@@ -27,9 +27,9 @@ _UNKNOWN_EXPOSURE_S = 0.01  # and as much more or less
 _STREAK_SIGMA_PX, _STREAK_SHARE = 0.5, 0.3  # of a streak where the exposure time is known
 _FAR_AHEAD_S, _AHEAD_SHARE = 0.1, 0.1  # a flow is trusted so long, and is off by so much
 _UNKNOWN_ROW_TIME_S = 2e-5  # of common sensors 5 to 30 us
-_TOLD_BY = 5  # streaks tell the exposure time
+_FEWEST_STREAKS = 5  # from which the exposure time is learnt
 _REMEMBERED = 31
-_LEAST_STREAK_PX = 2.0  # that tells of it
+_LEAST_STREAK_PX = 2.0  # from which it is learnt
 _SAME_PX = 1.0  # two poses of one marker show it almost alike
 
 
@@ -37,8 +37,8 @@ class Tracker:
     """Follows markers through the images of one camera. For one thread at a time.
 
     Attributes:
-        exposure_s: the exposure time, as it was told or as streaks tell it; None if nothing has.
-        row_time_s: from the exposure of one row to that of the next; None if nobody has told.
+        exposure_s: the exposure time, given or learnt from streaks; None if it is not known.
+        row_time_s: from the exposure of one row to that of the next; None if it is not known.
     """
 
     def __init__(self, exposure_s: float | None = None, row_time_s: float | None = None):
@@ -46,16 +46,16 @@ class Tracker:
         exposure_s: the exposure time, where it is known.
         row_time_s: from the exposure of one row to that of the next, where it is known.
         """
-        self._told = False
+        self._is_given = False
         self.exposure_s: float | None = None
         self.row_time_s: float | None = None
-        self.tell(exposure_s, row_time_s)
+        self.set_timing(exposure_s, row_time_s)
         self._exposures_s: deque[float] = deque(maxlen=_REMEMBERED)
 
-    def tell(self, exposure_s: float | None, row_time_s: float | None) -> None:
-        """Tell the camera's timing; what is None stays as it was."""
+    def set_timing(self, exposure_s: float | None, row_time_s: float | None) -> None:
+        """Set the camera's timing; what is None stays as it was."""
         if exposure_s is not None:
-            self.exposure_s, self._told = exposure_s, True
+            self.exposure_s, self._is_given = exposure_s, True
         if row_time_s is not None:
             self.row_time_s = row_time_s
 
@@ -86,7 +86,9 @@ class Tracker:
             image's middle row.
         """
         if flow_px_s is not None:
-            flow_px_s = self._credible(flow_px_s)
+            # A marker so fast could not be seen: the estimate jumped.
+            streaks_px = self._likely_exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
+            flow_px_s = np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
         read = set() if decoded is None else set(zip(decoded.families, decoded.ids, strict=True))
         sides_px = [mean_side_px(quad) for quad in quads_px]
         places: dict[tuple[str, int], list[int]] = {}  # of each marker, the largest first
@@ -97,7 +99,7 @@ class Tracker:
         targets = []
         for (family, marker_id), at in missing:
             streak_px, sigma_px = (0.0, 0.0), np.inf
-            quads, within_px, flow = _apart(quads_px[at]), float(np.max(radius_px[at])), at[0]
+            quads, within_px, flow = _distinct(quads_px[at]), float(np.max(radius_px[at])), at[0]
             if flow_px_s is not None and np.all(np.isfinite(flow_px_s[flow])):
                 streak_px, sigma_px = self._streak(flow_px_s[flow])
                 ahead_px = flow_px_s[flow] * min(max(ahead_s, -_FAR_AHEAD_S), _FAR_AHEAD_S)
@@ -114,24 +116,18 @@ class Tracker:
         flows_px_s = [flow_px_s[at[0]] for _, at in missing]
         self._learn(flows_px_s, tracks)
         seen = [f for f, one in zip(flows_px_s, tracks, strict=True) if one is not None]
-        return self._of_one_time(
+        return self._at_middle_row(
             found, np.nan_to_num(np.reshape(seen, (-1, 2))), (len(image) - 1) / 2
         )
 
     @property
     def learnt_exposure_s(self) -> float | None:
-        """The exposure time by streaks; None where it was told, or nothing has told it."""
-        return None if self._told else self.exposure_s
+        """The exposure time by streaks; None where it was given, or is not known."""
+        return None if self._is_given else self.exposure_s
 
     @property
     def _likely_exposure_s(self) -> float:
         return _UNKNOWN_EXPOSURE_S if self.exposure_s is None else self.exposure_s
-
-    def _credible(self, flow_px_s: np.ndarray) -> np.ndarray:
-        """The velocities, NaN where they are those of a belief that jumped: of a marker that is so
-        fast nothing can be seen."""
-        streaks_px = self._likely_exposure_s * np.linalg.norm(flow_px_s, axis=1, keepdims=True)
-        return np.where(streaks_px <= MOST_STREAK_PX, flow_px_s, np.nan)
 
     def _streak(self, flow_px_s: np.ndarray) -> tuple[tuple[float, float], float]:
         """The expected streak, px, and its standard deviation."""
@@ -142,7 +138,7 @@ class Tracker:
         sigma_px = _STREAK_SIGMA_PX + share * exposure_s * speed_px_s
         return (float(streak[0]), float(streak[1])), sigma_px
 
-    def _of_one_time(
+    def _at_middle_row(
         self, found: Detections, flows_px_s: np.ndarray, middle_px: float
     ) -> Detections:
         """The corners at the time of the middle row."""
@@ -155,24 +151,24 @@ class Tracker:
         return replace(found, sigma_px=np.hypot(found.sigma_px, unknown_px))
 
     def _learn(self, flows_px_s: Sequence[np.ndarray], tracks: Sequence[Track | None]) -> None:
-        if self._told:
+        if self._is_given:
             return
         for flow_px_s, one in zip(flows_px_s, tracks, strict=False):
             speed = float(np.hypot(*flow_px_s))
             if one is None or not np.hypot(*one.streak_px) >= _LEAST_STREAK_PX or not speed > 0:
                 continue
             self._exposures_s.append(abs(float(one.streak_px @ flow_px_s)) / speed**2)
-        if len(self._exposures_s) >= _TOLD_BY:
+        if len(self._exposures_s) >= _FEWEST_STREAKS:
             self.exposure_s = float(np.median(self._exposures_s))
 
 
-def _apart(quads_px: Float[np.ndarray, "H 4 2"]) -> Float[np.ndarray, "P 4 2"]:
+def _distinct(quads_px: Float[np.ndarray, "H 4 2"]) -> Float[np.ndarray, "P 4 2"]:
     """The quadrilaterals without those that are almost the same as an earlier one."""
-    apart = [quads_px[0]]
+    distinct = [quads_px[0]]
     for quad in quads_px[1:]:
-        if all(np.max(np.abs(quad - other)) > _SAME_PX for other in apart):
-            apart.append(quad)
-    return np.stack(apart)
+        if all(np.max(np.abs(quad - other)) > _SAME_PX for other in distinct):
+            distinct.append(quad)
+    return np.stack(distinct)
 
 
 def detections_of(tracks: Sequence[Track]) -> Detections:

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxnav.core.models.camera import Camera as CameraModel
 from jaxnav.detection.families import marker_cells, printed
-from jaxnav.detection.signs_of_life import telling
+from jaxnav.detection.signs_of_life import watched_by
 from jaxnav.detection.track import warm_up_fits
 from jaxnav.detection.tracker import Tracker
 from jaxnav.detection.types import Detections, Detector, RegionDetector
@@ -147,7 +147,7 @@ class Search:
         if self.tracker is None or not region.keys or frame.image is None:
             return detections
         row_time_s = _told("row_time_s", frame.row_time_s)
-        self.tracker.tell(_told("exposure_s", frame.exposure_s), row_time_s)
+        self.tracker.set_timing(_told("exposure_s", frame.exposure_s), row_time_s)
         ahead_ns = 0 if region.stamp_ns is None else frame.stamp_ns - region.stamp_ns
         followed = self.tracker.follow(
             frame.image,
@@ -243,7 +243,7 @@ class Eyes:
         """Take turns until the end, watched by the guard. Runs in a thread."""
         beat = partial(self._guard.beat, name)
         try:
-            with telling(beat):
+            with watched_by(beat):
                 while not self._over.is_set():
                     beat()
                     turn()

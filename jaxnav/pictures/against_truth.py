@@ -1,4 +1,4 @@
-"""Draw cars that drove from the same start: where they went, and how far off they believed."""
+"""Draw cars that drove from the same start: their ways, and the errors of their poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from jaxnav.core.models.geometry import wrap_angle_np
 from jaxnav.pictures.localisation import BLACK, BLUE, ORANGE, draw_markers, draw_waypoints
 
-COLORS = (BLUE, ORANGE)
 _STYLES = ({"color": BLUE}, {"color": ORANGE}, {"color": ORANGE, "ls": ":"})
 _LEAST_M, _LEAST_DEG = 1e-3, 0.01  # where the logarithmic axes end
 
@@ -45,7 +44,7 @@ def report_against_truth(
     listened: Sequence[Driven] = (),
     title: str = "",
 ) -> Figure:
-    """Draw the ways of one or two cars, and the errors of what each believed, against time.
+    """Draw the ways of one or two cars, and the errors of their poses against time.
 
     Args:
         drives: ours and, where there is one, the other's.
@@ -87,10 +86,10 @@ def _draw_ways(
     waypoint_radius_m: float,
     markers_m: np.ndarray,
 ) -> None:
-    for drive, color in zip(drives, COLORS, strict=False):
-        way, believed = drive.true_poses, drive.poses
+    for drive, color in zip(drives, (BLUE, ORANGE), strict=False):
+        way, estimate = drive.true_poses, drive.poses
         axes.plot(way[:, 0], way[:, 1], color=color, lw=2.2, label=f"{drive.label}: way driven")
-        axes.plot(believed[:, 0], believed[:, 1], color=color, lw=0.9, ls="--")
+        axes.plot(estimate[:, 0], estimate[:, 1], color=color, lw=0.9, ls="--")
         axes.plot(*way[-1, :2], "s", color=color, ms=5)
     axes.plot([], [], color=BLACK, lw=0.9, ls="--", label="where it believed to be")
     start = drives[0].true_poses[0, :2]

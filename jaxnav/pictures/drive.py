@@ -30,6 +30,7 @@ from jaxnav.pictures.localisation import (
     VERMILION,
     draw_markers,
     draw_waypoints,
+    evenly,
 )
 from jaxnav.pictures.scenery import Scenery
 from jaxnav.recordings.drive_log import DriveLog
@@ -302,7 +303,7 @@ def _draw_track(axes: Axes, track_m: np.ndarray, health: np.ndarray) -> None:
 
 def _draw_ellipses(axes: Axes, outcomes: Outcomes, known: np.ndarray) -> None:
     """Draw the 95 % ellipses of the vehicle's position, evenly spaced in time."""
-    for number, index in enumerate(known[_evenly(len(known), _ELLIPSES)]):
+    for number, index in enumerate(known[evenly(len(known), _ELLIPSES)]):
         covariance = outcomes.covariance[index][:2, :2]
         if covariance.shape != (2, 2) or not np.isfinite(covariance).all():
             continue
@@ -320,7 +321,7 @@ def _candidate_poses(outcomes: Outcomes) -> dict[bool, np.ndarray]:
     """Whether selected -> (N, 3) planar poses of single frames' candidates, evenly spaced."""
     candidates: dict[bool, list[np.ndarray]] = {True: [], False: []}
     seen = [index for index, Ts in enumerate(outcomes.Ts_vehicle_world) if len(Ts)]
-    for index in (seen[number] for number in _evenly(len(seen), _CANDIDATES)):
+    for index in (seen[number] for number in evenly(len(seen), _CANDIDATES)):
         for number, T_vehicle_world in enumerate(outcomes.Ts_vehicle_world[index]):
             w, x, y, z, *place_m = poses.inverse(T_vehicle_world)
             psi_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
@@ -334,7 +335,7 @@ def _alternatives(outcomes: Outcomes) -> np.ndarray:
     several = [index for index, bank in enumerate(outcomes.hypotheses) if len(bank) > 1]
     rows = [
         np.delete(outcomes.hypotheses[index], np.argmax(outcomes.log_weight[index]), axis=0)
-        for index in (several[number] for number in _evenly(len(several), _CANDIDATES))
+        for index in (several[number] for number in evenly(len(several), _CANDIDATES))
     ]
     return np.vstack([np.zeros((0, 3)), *rows])
 
@@ -350,8 +351,3 @@ def _draw_headings(axes: Axes, rows: np.ndarray, color: str, marker: str, label:
         x_m, y_m, np.cos(psi_rad), np.sin(psi_rad), color=color, zorder=2,
         scale_units="inches", scale=7, width=0.0022, headwidth=0,
     )  # fmt: skip
-
-
-def _evenly(count: int, most: int) -> np.ndarray:
-    """At most `most` evenly spaced indices below `count`, from the first to the last."""
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(int))

@@ -14,14 +14,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = (
-    "#000000",
-    "#E69F00",
-    "#56B4E9",
-    "#009E73",
-    "#0072B2",
-    "#D55E00",
-)
+BLACK, ORANGE, SKY = "#000000", "#E69F00", "#56B4E9"
+GREEN, BLUE, VERMILION = "#009E73", "#0072B2", "#D55E00"
+COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK, "#CC79A7", "#8C8C8C")  # of a series
+STYLES = ("-", "--", "-.", ":")
 SELECTED, OTHER = BLUE, ORANGE
 PHOTO_DPI = 100.0  # pixels of a photograph in an inch of its picture
 _USUAL_PX = 1200.0  # diagonal of a photograph whose words are as large as usual
@@ -147,34 +143,45 @@ def photo_with_poses(view: AnnotatedFrame) -> Figure:
 
 
 def reliability_diagram(
-    predicted: Float[np.ndarray, " B"],
-    observed: Float[np.ndarray, " B"],
-    intervals: tuple[Float[np.ndarray, " B"], Float[np.ndarray, " B"]],
-    counts: Int[np.ndarray, " B"],
-    title: str = "",
+    curves: Mapping[str, tuple[Float[np.ndarray, " B"], ...]], title: str = ""
 ) -> Figure:
-    """Draw observed frequencies against predicted probabilities.
+    """Draw observed frequencies of flips against predicted probabilities.
 
     Args:
-        predicted: (B,) mean prediction of each bin.
-        observed: (B,) frequency in each bin.
-        intervals: lower and upper end (B,) of the frequency's interval.
-        counts: (B,) members of each bin, drawn below.
+        curves: label -> mean prediction of each of B bins, frequency there, lower and upper end of
+            the frequency's interval, and how many are in the bin. Empty bins are not drawn.
         title: above everything.
     """
     figure = Figure(figsize=(6, 6.5), layout="constrained")
     figure.suptitle(title, fontsize=9)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
-    upper.plot([0, 1], [0, 1], color=BLACK, lw=1, ls=":", label="calibrated")
-    upper.vlines(predicted, *intervals, color=BLUE, lw=1)
-    upper.plot(predicted, observed, "o-", color=BLUE, ms=4, label="observed")
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    upper.plot((0, 1), (0, 1), color=BLACK, lw=0.8, ls=":")
+    for number, (label, columns) in enumerate(curves.items()):
+        used = columns[-1] > 0
+        predicted, observed, low, high, counts = (column[used] for column in columns)
+        color, style = look(number)
+        reach = np.maximum(observed - low, 0), np.maximum(high - observed, 0)
+        upper.errorbar(
+            predicted, observed, yerr=reach, color=color, ls=style, marker="o", ms=3, capsize=2,
+            label=label,
+        )  # fmt: skip
+        lower.step(predicted, counts, where="mid", color=color, ls=style)
     upper.set(ylabel="frequency of a flip", xlim=(0, 1), ylim=(0, 1))
     upper.legend(loc="upper left", fontsize=8)
-    lower.bar(predicted, counts, width=0.03, color=BLUE)
     lower.set(xlabel="flip probability", ylabel="frames", yscale="log")
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
     return figure
+
+
+def look(number: int) -> tuple[str, str]:
+    """Colour and line style of one of a series of curves."""
+    return COLOURS[number % len(COLOURS)], STYLES[number % len(STYLES)]
+
+
+def evenly(count: int, most: int) -> Int[np.ndarray, " n"]:
+    """At most `most` evenly spaced indices below `count`, from the first to the last."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, most)).round().astype(int))
 
 
 def _fit_view(axes: Axes, points: np.ndarray) -> None:
@@ -209,12 +216,8 @@ def _show(axes: Axes, view: AnnotatedFrame, scale: float = 1.0, least_px: float 
         axes.plot(closed[:, 0], closed[:, 1], color=GREEN, lw=1.2 * scale)
         axes.plot(*corners[0], "o", color=GREEN, ms=3 * scale)
     for sticks, color in ((view.other_px, OTHER), (view.selected_px, SELECTED)):
-        arrow = {
-            "arrowstyle": "->",
-            "color": color,
-            "lw": 1.8 * scale,
-            "mutation_scale": 10 * scale,
-        }
+        arrow = {"arrowstyle": "->", "color": color, "lw": 1.8 * scale}
+        arrow["mutation_scale"] = 10 * scale
         for foot, tip in sticks:
             length_px = np.linalg.norm(tip - foot)
             if 0 < length_px < least_px:

@@ -1,4 +1,4 @@
-"""Draw what a drive says of its sensors: a calibration of odometry, and what is learnt."""
+"""Draw a calibration of odometry, and the sensor errors that a drive has learnt."""
 
 import textwrap
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from jaxnav.calibrate.odometry.calibrate import OdometryCalibration
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.models.vehicle import SENSOR_ERRORS, Vehicle
-from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, evenly
 from jaxnav.recordings.learnt import Learnt
 from jaxnav.recordings.records import Outcomes
 
@@ -78,7 +78,7 @@ def _draw_readings(axes: Axes, calibration: OdometryCalibration) -> None:
     times_s = calibration.node_times_s[:-1]
     axes.plot(times_s, calibration.read[:, 0], color=SKY, lw=1, label="speed (m/s)")
     axes.plot(times_s, calibration.read[:, 1], color=VERMILION, lw=1, label="steering (rad)")
-    axes.set(xlabel="time (s)", ylabel="as read (m/s, rad)", title="what the odometer said")
+    axes.set(xlabel="time (s)", ylabel="as read (m/s, rad)", title="readings of the odometer")
     axes.legend(fontsize="small")
 
 
@@ -88,7 +88,7 @@ def learnt_over_time(outcomes: Outcomes, rig: CameraRig, vehicle: Vehicle) -> Fi
     A row of panels for the cameras, turned about the vehicle's axes, and one for the sensors.
     """
     known = np.flatnonzero(np.isfinite(outcomes.errors).all(axis=1) & outcomes.located)
-    shown = known[np.unique(np.linspace(0, len(known) - 1, _POINTS).astype(int))]
+    shown = known[evenly(len(known), _POINTS)]
     states = [
         Learnt.from_errors(outcomes.errors[i], outcomes.errors_sigma[i], rig, vehicle)
         for i in shown

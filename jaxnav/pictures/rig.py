@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from jaxnav.calibrate.rig.calibrate import RigCalibration
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
-from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.pictures.localisation import BLACK, BLUE, COLOURS, SKY, VERMILION, evenly
 
-_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
 _ARROWS = 400  # residuals drawn for each camera
 
 
@@ -77,9 +76,7 @@ def map_check(
     before, after = flat.reshape(2, -1, 4, 2)
     for a, b, marker_id, off in zip(before, after, ids, wrong, strict=True):
         axes.plot(*a[[0, 1, 2, 3, 0]].T, color=SKY, linewidth=4)
-        axes.plot(*b[[0, 1, 2, 3, 0]].T, color=VERMILION if off else BLACK, linewidth=1.5)
-        axes.annotate(str(marker_id), b.mean(axis=0), textcoords="offset points",
-                      xytext=(5, 5), fontsize=9)  # fmt: skip
+        _draw_marker(axes, b, marker_id, VERMILION if off else BLACK, BLACK)
         if off:
             axes.annotate("", xy=b.mean(axis=0), xytext=a.mean(axis=0),
                           arrowprops={"arrowstyle": "->", "color": VERMILION})  # fmt: skip
@@ -96,11 +93,17 @@ def _draw_map(
     corners, path = flat[: 4 * len(corners_m)].reshape(-1, 4, 2), flat[4 * len(corners_m) :]
     axes.plot(*path.T, color=SKY, linewidth=1, label="path")
     for square, marker_id in zip(corners, marker_ids, strict=True):
-        axes.plot(*square[[0, 1, 2, 3, 0]].T, color=BLACK, linewidth=2)
-        axes.annotate(str(marker_id), square.mean(axis=0), textcoords="offset points",
-                      xytext=(4, 4), fontsize=8, color=VERMILION)  # fmt: skip
+        _draw_marker(axes, square, marker_id, BLACK, VERMILION)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel=labels[0], ylabel=labels[1], title="markers and path in the world")
+
+
+def _draw_marker(
+    axes: Axes, corners: np.ndarray, marker_id: int, colour: str, of_text: str
+) -> None:
+    axes.plot(*corners[[0, 1, 2, 3, 0]].T, color=colour, linewidth=1.5)
+    axes.annotate(str(marker_id), corners.mean(axis=0), textcoords="offset points",
+                  xytext=(5, 5), fontsize=9, color=of_text)  # fmt: skip
 
 
 def _flattened(points: np.ndarray) -> tuple[np.ndarray, tuple[str, str]]:
@@ -117,7 +120,7 @@ def _draw_cameras(
     length = max(0.35 * float(spread.max()), 0.02)
     for Ts, alpha in ((given, 0.35), (Ts_vehicle_camera, 1.0)):
         for index, T in enumerate(Ts):
-            colour = _COLOURS[index % len(_COLOURS)]
+            colour = COLOURS[index % len(COLOURS)]
             foot, way = T[:3, 3], length * T[:3, 2]
             axes.annotate(
                 "", xy=(foot + way)[flat], xytext=foot[flat],
@@ -144,7 +147,7 @@ def _draw_residuals(
     width, height = size_px
     full = weight >= 1
     if len(centers_px):
-        rows = np.unique(np.linspace(0, len(centers_px) - 1, _ARROWS).astype(int))
+        rows = evenly(len(centers_px), _ARROWS)
         typical = float(np.median(np.hypot(*residuals_px.T))) or 1.0
         scale = 0.04 * width / typical
         inside = rows[full[rows]]

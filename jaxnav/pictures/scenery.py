@@ -1,6 +1,6 @@
 """Read a recorded drive's cameras, markers and waypoints, for drawing.
 
-The source is the header of the recording, in the words of the rig, marker and route files. Entries
+The source is the header of the recording, in the form of the rig, marker and route files. Entries
 that are missing or have another form are left out of the picture.
 """
 

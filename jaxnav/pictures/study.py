@@ -13,10 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.pictures.localisation import look, reliability_diagram
 
-_COLORS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK, "#CC79A7", "#8C8C8C")
-_STYLES = ("-", "--", "-.", ":")
 _MAP_WIDTH, _MAP_HEIGHT = 3.9, 3.5  # of one panel, inches
 
 
@@ -97,38 +95,13 @@ def study_curves(summary: xr.Dataset, measures: Sequence[str], x: str, lines: st
 
 def study_reliability(summary: xr.Dataset) -> Figure:
     """Draw predicted against observed frequencies of each selector, and their counts."""
+    curves = {}
     selectors = list(summary["selector"].values) if "selector" in summary.sizes else [None]
-    figure = Figure(figsize=(6, 6.4), layout="constrained")
-    upper, lower = figure.subplots(2, 1, height_ratios=(3, 1), sharex=True)
-    upper.plot((0, 1), (0, 1), color=BLACK, lw=0.8, ls=":")
-    for number, name in enumerate(selectors):
+    for name in selectors:
         of = summary.sel(selector=name) if name is not None else summary
-        counts = of["reliability_count"].values
-        used = counts > 0
-        predicted, observed = (
-            of[f"reliability_{what}"].values[used] for what in ("predicted", "observed")
-        )
-        color, style = _look(number)
-        ends = (of["reliability_low"].values[used], of["reliability_high"].values[used])
-        upper.errorbar(
-            predicted,
-            observed,
-            yerr=(np.maximum(observed - ends[0], 0), np.maximum(ends[1] - observed, 0)),
-            color=color,
-            ls=style,
-            marker="o",
-            ms=3,
-            capsize=2,
-            label=str(name) if name is not None else "",
-        )
-        lower.step(predicted, counts[used], where="mid", color=color, ls=style)
-    upper.set(ylabel="flipped", xlim=(0, 1), ylim=(0, 1))
-    lower.set(xlabel="flip probability", ylabel="frames", yscale="log")
-    if selectors[0] is not None:
-        upper.legend(loc="upper left", fontsize=8)
-    for axes in (upper, lower):
-        axes.grid(alpha=0.3)
-    return figure
+        parts = ("predicted", "observed", "low", "high", "count")
+        curves[str(name or "observed")] = tuple(of[f"reliability_{p}"].values for p in parts)
+    return reliability_diagram(curves)
 
 
 def _curves(axes: Axes, summary: xr.Dataset, measure: str, x: str, lines: str | None) -> None:
@@ -141,7 +114,7 @@ def _curves(axes: Axes, summary: xr.Dataset, measure: str, x: str, lines: str | 
             array = summary[name].sel({on_lines: label}) if on_lines else summary[name]
             return array.squeeze(drop=True).values
 
-        color, style = _look(number)
+        color, style = look(number)
         name = "" if label is None else _value_label(summary[on_lines], label)
         axes.plot(values, part(measure), color=color, ls=style, marker="o", ms=3, label=name)
         if f"{measure}_low" in summary:
@@ -157,10 +130,6 @@ def _curves(axes: Axes, summary: xr.Dataset, measure: str, x: str, lines: str | 
     if measure.endswith("_rate"):
         axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
-
-
-def _look(number: int) -> tuple[str, str]:
-    return _COLORS[number % len(_COLORS)], _STYLES[number % len(_STYLES)]
 
 
 def _scale(data: xr.DataArray) -> Normalize:

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from jaxnav.experiments.tuning.fit import ControllerScores, EstimatorScores, TuningFit
 from jaxnav.experiments.tuning.unconstrained import Space
-from jaxnav.pictures.localisation import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION
+from jaxnav.pictures.localisation import BLACK, BLUE, COLOURS, GREEN, SKY, VERMILION
 
-_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, BLACK)
 _LINES = ("-", "--", ":")
 
 
@@ -68,7 +67,7 @@ def _draw_parts(
     names = [f"{name}\n{when}" for name in driven for when in ("before", "after")]
     pairs = [one for pair in driven.values() for one in pair]
     foot = np.zeros(len(pairs))
-    for part, colour in zip(pairs[0].parts, _COLOURS, strict=False):
+    for part, colour in zip(pairs[0].parts, COLOURS, strict=False):
         heights = np.array([one.parts[part] for one in pairs])
         axes.bar(np.arange(len(pairs)), heights, bottom=foot, color=colour, label=part)
         foot += heights
@@ -104,8 +103,8 @@ def draw_parameters(axes: Axes, fit: TuningFit, space: Space) -> None:
             label = name if flat.shape[1] == 1 else f"{name}[{entry}]"
             axes.plot(
                 flat[:, entry] / flat[0, entry],
-                color=_COLOURS[number % len(_COLOURS)],
-                ls=_LINES[number // len(_COLOURS) % len(_LINES)],
+                color=COLOURS[number % len(COLOURS)],
+                ls=_LINES[number // len(COLOURS) % len(_LINES)],
                 label=label,
             )
             number += 1

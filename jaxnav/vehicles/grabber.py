@@ -1,4 +1,4 @@
-"""Read a camera whose driver may block in a thread of its own, so that `read` keeps its timeout.
+"""Cameras whose pictures come in a thread of their own, so that `read` keeps its timeout.
 
 A slow reader gets the newest picture, not the oldest.
 """
@@ -14,32 +14,26 @@ _PATIENCE_S = 0.5  # time that `close` waits for a hanging driver, before it aba
 _RETRY_S = 0.25  # after an error
 
 
-class Grabber:
-    """A `Camera` made of two functions of a driver, which only one thread calls."""
+class NewestFrame:
+    """A `Camera` that another thread feeds by `add`."""
 
-    def __init__(
-        self,
-        name: str,
-        grab: Callable[[], Frame | None],
-        release: Callable[[], None],
-        pause_s: float = 0.0,
-    ):
-        """Start to grab frames.
-
-        Args:
-            name: the camera's name in the rig.
-            grab: returns the next frame, whose image the caller may keep, or None if there is no
-                new one. May block, and raise OSError.
-            release: releases the hardware; called once, after the last `grab`.
-            pause_s: pause after each None.
+    def __init__(self, name: str, leave: Callable[[], None]):
+        """Args:
+        name: the camera's name in the rig.
+        leave: called whenever the camera is closed.
         """
-        self.name, self._grab, self._release, self._pause_s = name, grab, release, pause_s
+        self.name, self._leave = name, leave
         self._changed = threading.Condition()
         self._closing = threading.Event()
         self._frame: Frame | None = None
         self._error: OSError | None = None
-        self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
-        self._thread.start()
+
+    def add(self, frame: Frame | None, error: OSError | None = None) -> None:
+        """Take a frame, if there is one, and an error that the next read raises, or none."""
+        with self._changed:
+            self._frame = self._frame if frame is None else frame
+            self._error = error
+            self._changed.notify_all()
 
     def read(self, timeout_s: float) -> Frame | None:
         """The newest frame that was not read yet; None if none comes within the timeout.
@@ -64,11 +58,36 @@ class Grabber:
                 self._changed.wait(left_s)
 
     def close(self) -> None:
-        """Release the hardware; a waiting `read` returns. May be called any number of times."""
+        """Leave the source; a waiting `read` returns. May be called any number of times."""
         with self._changed:
             self._closing.set()
             self._changed.notify_all()
-        self._thread.join(_PATIENCE_S)
+        self._leave()
+
+
+class Grabber(NewestFrame):
+    """A camera made of two functions of a driver that may block, which only one thread calls."""
+
+    def __init__(
+        self,
+        name: str,
+        grab: Callable[[], Frame | None],
+        release: Callable[[], None],
+        pause_s: float = 0.0,
+    ):
+        """Start to grab frames.
+
+        Args:
+            name: the camera's name in the rig.
+            grab: returns the next frame, whose image the caller may keep, or None if there is no
+                new one. May block, and raise OSError.
+            release: releases the hardware; called once, after the last `grab`.
+            pause_s: pause after each None.
+        """
+        super().__init__(name, lambda: self._thread.join(_PATIENCE_S))
+        self._grab, self._release, self._pause_s = grab, release, pause_s
+        self._thread = threading.Thread(target=self._run, name=f"camera {name}", daemon=True)
+        self._thread.start()
 
     def _run(self) -> None:
         while not self._closing.is_set():
@@ -80,10 +99,7 @@ class Grabber:
             except Exception as error:
                 # Drivers raise any exception; a thread that died of one would not report it.
                 failure, pause_s = OSError(f"{type(error).__name__}: {error}"), _RETRY_S
-            with self._changed:
-                self._frame = self._frame if frame is None else frame
-                self._error = failure
-                self._changed.notify_all()
+            self.add(frame, failure)
             if frame is None:
                 self._closing.wait(pause_s)
         with contextlib.suppress(Exception):  # nothing could be done about it

@@ -20,7 +20,7 @@ from jaxnav.drive.interfaces import Camera, Frame, Setup, Vehicle
 from jaxnav.errors import BadInput
 from jaxnav.files.images import open_video
 from jaxnav.vehicles.grabber import Grabber
-from jaxnav.vehicles.options import latency_ns
+from jaxnav.vehicles.options import by_camera, latency_ns
 
 _PREFIX = "source."
 _DEFAULT_RATE_HZ = 30.0  # of a file that does not say
@@ -33,19 +33,15 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
         BadInput: a source is missing, can't be opened, or gives images of another size.
     """
     names, options = setup.rig.names, setup.options
-    for key in options:
-        if key.startswith(_PREFIX) and key.removeprefix(_PREFIX) not in names:
-            raise BadInput(
-                f"--option {key}", f"the rig has no such camera: expected {', '.join(names)}"
-            )
+    sources = by_camera(options, _PREFIX, names)
     delay_ns = latency_ns(options)
     captures: list[_Capture] = []
     try:
         for name, size_px in zip(names, setup.rig.image_sizes_px, strict=True):
             key = _PREFIX + name
-            if not options.get(key):
+            if not sources.get(name):
                 raise BadInput(f"--option {key}", "missing: a device, a video or a pipeline")
-            captures.append(_Capture(f"--option {key}", options[key], size_px, delay_ns))
+            captures.append(_Capture(f"--option {key}", sources[name], size_px, delay_ns))
     except BadInput:
         for capture in captures:
             capture.release()

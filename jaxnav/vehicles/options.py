@@ -1,7 +1,7 @@
 """Parse the values of `--option KEY=VALUE`, and report wrong ones to a person."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from jaxnav.errors import BadInput
 
@@ -50,6 +50,32 @@ def choice(options: Mapping[str, str], key: str, known: tuple[str, ...]) -> str:
     if value not in known:
         raise BadInput(f"--option {key}", f"expected {' or '.join(known)}, got {value!r}")
     return value
+
+
+def switch(options: Mapping[str, str], key: str) -> bool:
+    """An option that is `true`, or `false` as it is by default.
+
+    Raises:
+        BadInput: another word.
+    """
+    return choice(options, key, ("false", "true")) == "true"
+
+
+def by_camera(options: Mapping[str, str], prefix: str, names: Sequence[str]) -> dict[str, str]:
+    """The values of the options `prefix` + camera, by the camera's name.
+
+    Args:
+        names: of the rig's cameras.
+
+    Raises:
+        BadInput: the rig has no such camera.
+    """
+    values = {key.removeprefix(prefix): options[key] for key in options if key.startswith(prefix)}
+    for name in values:
+        if name not in names:
+            problem = f"the rig has no such camera: expected {', '.join(names)}"
+            raise BadInput(f"--option {prefix}{name}", problem)
+    return values
 
 
 def latency_ns(options: Mapping[str, str]) -> int:

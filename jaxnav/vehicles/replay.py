@@ -30,7 +30,7 @@ from jaxnav.files.images import decode_image
 from jaxnav.recordings.drive_log import DriveLog, read_drive
 from jaxnav.recordings.drive_replay import check_inputs, recorded_pixels
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.vehicles.options import choice
+from jaxnav.vehicles.options import switch
 
 _WAITS_NS = 50_000_000  # longest wait of a reading when several came between two looks
 _LINGERS_NS = 50_000_000  # time after the last input for the search of its markers
@@ -226,12 +226,10 @@ def open_cameras(setup: Setup, vehicle: AnyVehicle) -> Sequence[Camera]:
     for given in log.inputs:
         for sighted in given.frames:
             frames[vehicle.camera_names[sighted.camera]].append((given.now_ns, sighted))
-    jpegs = _jpegs(log, rig) if _shows_images(setup.options) else {name: {} for name in rig.names}
-    return [ReplayCamera(name, vehicle.clock, frames[name], jpegs[name]) for name in rig.names]
-
-
-def _shows_images(options: Mapping[str, str]) -> bool:
-    return choice(options, "images", ("false", "true")) == "true"
+    jpegs = _jpegs(log, rig) if switch(setup.options, "images") else {}
+    return [
+        ReplayCamera(name, vehicle.clock, frames[name], jpegs.get(name, {})) for name in rig.names
+    ]
 
 
 def _recorded(options: Mapping[str, str]) -> tuple[DriveLog, DriveSetup]:
@@ -246,7 +244,7 @@ def _recorded(options: Mapping[str, str]) -> tuple[DriveLog, DriveSetup]:
     if not log.inputs:
         raise BadInput(path, "holds no input")
     check_inputs(log.inputs, own, path)
-    if _shows_images(options):
+    if switch(options, "images"):
         topics = [f"/camera/{name}" for name in own.rig.names]
         if not any(image.topic in topics for image in log.images()):
             raise BadInput(path, f"holds no image on {', '.join(topics)}")

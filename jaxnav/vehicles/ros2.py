@@ -7,7 +7,7 @@ Options, `--option KEY=VALUE`:
         with commas between them, and wheel_radius_m)
     command_topic (/drive; /cmd_vel of a base that is no car), command_type (ackermann:
         ackermann_msgs/AckermannDriveStamped whose speed is throttle * speed_per_throttle_mps, not
-        of such a base; twist: geometry_msgs/Twist; none: somebody else drives)
+        of such a base; twist: geometry_msgs/Twist; none: another node drives)
     imu_topic, imu_axis (0,0,1): sensor_msgs/Imu of the vehicle's gyro, and the vehicle's vertical
         in its axes
     sim_time (false): true takes the time of /clock
@@ -46,7 +46,7 @@ from jaxnav.recordings.ros.odometry_messages import (
     gyro,
     odometry,
 )
-from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.options import choice, number, switch
 from jaxnav.vehicles.ros.connection import Connection
 
 if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
@@ -55,8 +55,8 @@ if TYPE_CHECKING:  # the guard's process opens the vehicle without JAX
     from jaxnav.core.models.vehicle import TwistBase
     from jaxnav.core.models.vehicle import Vehicle as VehicleModel
 
-# Until somebody listens to the commands: what is sent before is lost, and a vehicle that hears
-# nothing is taken for one that is held fast.
+# Until the commands have a subscriber: what is sent before is lost, and a vehicle that gets no
+# commands is taken for one that is held fast.
 _HEARD_WITHIN_S, _LOOK_S = 5.0, 0.01
 _LOCK_PATIENCE_S = 0.03  # a `stop` waits this long for a message that another thread publishes
 _SHORT = {"odometry": ODOMETRY_TYPES[0], "ackermann": ACKERMANN}  # names of earlier releases
@@ -81,7 +81,7 @@ class RosVehicle:
     timeout_s = math.inf  # a subscriber may stop by itself, but does not say so
 
     def __init__(self, vehicle: VehicleModel | TwistBase, options: Mapping[str, str]):
-        """Subscribe to the odometry, and wait until somebody listens to the commands, up to 5 s.
+        """Subscribe to the odometry, and wait up to 5 s until the commands have a subscriber.
 
         Args:
             options: see the module.
@@ -106,7 +106,7 @@ class RosVehicle:
         self._closed = False
         self._writing = threading.Lock()  # so that no command follows the zero speed of a `stop`
         self._stops = 0
-        sim_time = choice(options, "sim_time", ("false", "true")) == "true"
+        sim_time = switch(options, "sim_time")
         self._connection = Connection("jaxnav_vehicle", sim_time)
         self._clock = self._connection.source_clock()
         self._publisher, self._command_type = None, None
@@ -193,7 +193,7 @@ class RosVehicle:
 
     @property
     def _is_heard(self) -> bool:
-        """Whether somebody listens to the commands, or there are none."""
+        """Whether the commands have a subscriber, or there are none."""
         return self._publisher is None or self._publisher.get_subscription_count() > 0
 
     def _command(self, command: Command) -> None:

@@ -11,7 +11,6 @@ Options, `--option KEY=VALUE`:
     stamps            monotonic, or ros: as they are in the messages
 """
 
-import threading
 from functools import partial
 from typing import Any, get_args
 
@@ -26,47 +25,12 @@ from jaxnav.recordings.ros.camera_messages import (
     detections,
     grey_image,
 )
-from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.grabber import NewestFrame
+from jaxnav.vehicles.options import by_camera, choice, number, switch
 from jaxnav.vehicles.ros.connection import Connection
 from jaxnav.vehicles.ros.source_clock import SourceClock
 
 _PREFIX = "camera."
-
-
-class RosCamera:
-    """A camera behind a topic. Implements `Camera`: a slow reader gets the newest frame."""
-
-    def __init__(self, name: str, leave: Any):
-        """Args:
-        leave: called when it is closed.
-        """
-        self.name = name
-        self._leave = leave
-        self._frame: Frame | None = None
-        self._came = threading.Condition()
-        self._closed = False
-
-    def add(self, frame: Frame) -> None:
-        """Take a frame from the topic."""
-        with self._came:
-            self._frame = frame
-            self._came.notify()
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """See `Camera`."""
-        with self._came:
-            if self._frame is None and not self._closed:
-                self._came.wait(timeout_s)
-            frame, self._frame = self._frame, None
-            return frame
-
-    def close(self) -> None:
-        """See `Camera`."""
-        with self._came:
-            closed, self._closed = self._closed, True
-            self._came.notify_all()
-        if not closed:
-            self._leave()
 
 
 def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
@@ -80,14 +44,10 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
     kind = choice(options, "camera_type", (APRILTAG_ROS, IMAGE, COMPRESSED))
     first_corner: Any = choice(options, "first_corner", get_args(FirstCorner))
     sigma_px = number(options, "corner_sigma_px", 0.3, 1e-3, 100.0)
-    topics = {k.removeprefix(_PREFIX): v for k, v in options.items() if k.startswith(_PREFIX)}
-    for name in topics:
-        if name not in names:
-            problem = f"the rig has no such camera: expected {', '.join(names)}"
-            raise BadInput(f"--option {_PREFIX}{name}", problem)
+    topics = by_camera(options, _PREFIX, names)
     if not topics:
         raise BadInput(f"--option {_PREFIX}{names[0]}", "missing: a topic of at least one camera")
-    sim_time = choice(options, "sim_time", ("false", "true")) == "true"
+    sim_time = switch(options, "sim_time")
     families = dict(zip(setup.markers.ids, setup.markers.families, strict=True))
     ros_time = choice(options, "stamps", ("monotonic", "ros")) == "ros"
     connection = Connection("jaxnav_cameras", sim_time, ros_time)
@@ -95,18 +55,18 @@ def open_cameras(setup: Setup, vehicle: Vehicle | None) -> list[Camera]:
     def seen(message: Any) -> Detections:
         return detections(kind, message, first_corner, sigma_px, families)
 
-    def take(camera: RosCamera, clock: SourceClock, message: Any) -> None:
+    def take(camera: NewestFrame, clock: SourceClock, message: Any) -> None:
         stamp_ns = clock.time_ns(message.header.stamp)
         if kind == APRILTAG_ROS:
             camera.add(Frame(stamp_ns, detections=seen(message)))
         else:
             camera.add(Frame(stamp_ns, grey_image(kind, message)))
 
-    def take_nothing(camera: RosCamera) -> None:
+    def take_nothing(camera: NewestFrame) -> None:
         """A message that can't be read is a frame of now without a picture, which is flagged."""
         camera.add(Frame(connection.now_ns()))
 
-    cameras = [RosCamera(name, connection.close) for name in names]
+    cameras = [NewestFrame(name, connection.close) for name in names]
     for camera in cameras:
         if camera.name in topics:
             connection.listen(

@@ -16,7 +16,8 @@ from jaxnav.drive.interfaces import AnyVehicle, Camera, Frame, GyroReading, HasT
 from jaxnav.drive.limits import limits_of
 from jaxnav.drive.standing_clock import WaitingClock
 from jaxnav.errors import BadInput
-from jaxnav.vehicles.options import choice, number
+from jaxnav.vehicles.grabber import NewestFrame
+from jaxnav.vehicles.options import number, switch
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import SimWorld, WorldSettings
 
@@ -24,6 +25,7 @@ _LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are
 # The clock waits for frames that are later than this: a camera is stale after 0.2 s, and a process
 # that renders on a core of its own takes 0.05 to 0.1 s, without which the simulation is slow.
 _LATE_S = 0.12
+_RETRY_S = 0.25  # between errors, once the renderer is gone
 
 
 class SimVehicle:
@@ -80,38 +82,24 @@ class _Shutter:
         clock: WaitingClock,
         rate_hz: float,
         renderer: RenderingProcess | None,
+        names: Sequence[str],
     ):
         self._world, self._clock, self._renderer = world, clock, renderer
         self._period_ns = int(1e9 / rate_hz)
         self._late_ns = Corrections.of(world.vehicle).frame_late_ns
-        self._news = threading.Condition()
-        self._frames: list[Frame] = []
+        self.cameras = [NewestFrame(name, self._close) for name in names]
         self._closed = False
-        self._error: str | None = None
         self._due_ns: int | None = None  # when the frames that are made now will have come
         clock.wait_for(lambda: self._due_ns, _LATE_S)
         self._thread = threading.Thread(target=self._run, name="jaxnav-sim-shutter", daemon=True)
         self._thread.start()
 
-    def frame(self, camera: int, after_ns: int, timeout_s: float) -> Frame | None:
-        """The last frame of a camera if it is newer than `after_ns`, else the next one."""
-        with self._news:
-            self._news.wait_for(lambda: self._closed or self._is_newer(after_ns), timeout_s)
-            if self._error is not None:
-                raise OSError(self._error)
-            return self._frames[camera] if self._is_newer(after_ns) else None
-
-    def close(self) -> None:
-        """End the thread and the renderer."""
-        with self._news:
-            self._closed = True
-            self._news.notify_all()
+    def _close(self) -> None:
+        """End the thread and the renderer: all cameras close together."""
+        self._closed = True
         self._thread.join(1.0)
         if self._renderer is not None:
             self._renderer.close()
-
-    def _is_newer(self, than_ns: int) -> bool:
-        return bool(self._frames) and self._frames[0].stamp_ns > than_ns
 
     def _run(self) -> None:
         clock, stamp_ns = self._clock, self._clock.now_ns()
@@ -121,17 +109,19 @@ class _Shutter:
                 while (left_ns := due_ns - clock.now_ns()) > 0 and not self._closed:
                     time.sleep(left_ns / 1e9)
                 self._due_ns = due_ns
-                frames = self._looked(stamp_ns)
-                self._due_ns = None
-                with self._news:
-                    self._frames = frames
-                    self._news.notify_all()
+                try:
+                    frames = self._looked(stamp_ns)
+                finally:
+                    self._due_ns = None
+                for camera, frame in zip(self.cameras, frames, strict=False):
+                    camera.add(frame)
                 behind = max(clock.now_ns() - due_ns, 0) // self._period_ns
                 stamp_ns += (behind + 1) * self._period_ns
         except OSError as error:
-            self._error = None if self._closed else str(error)
-        finally:
-            self._due_ns = None
+            while not self._closed:
+                for camera in self.cameras:
+                    camera.add(None, error)
+                time.sleep(_RETRY_S)
 
     def _looked(self, stamp_ns: int) -> list[Frame]:
         if self._renderer is None:
@@ -140,28 +130,6 @@ class _Shutter:
         times_ns = stamp_ns + (1e9 * track_times_s()).astype(int)
         poses = np.array([self._world.state(int(t))[:3] for t in times_ns])
         return [Frame(stamp_ns + self._late_ns, image) for image in self._renderer.render(poses)]
-
-
-class SimCamera:
-    """One camera of the simulated car."""
-
-    def __init__(self, name: str, camera: int, shutter: _Shutter):
-        """Args:
-        camera: its index in the rig.
-        """
-        self.name, self._camera, self._shutter = name, camera, shutter
-        self._last_ns = 0
-
-    def read(self, timeout_s: float) -> Frame | None:
-        """See `Camera`."""
-        frame = self._shutter.frame(self._camera, self._last_ns, timeout_s)
-        if frame is not None:
-            self._last_ns = frame.stamp_ns
-        return frame
-
-    def close(self) -> None:
-        """See `Camera`. All cameras close together: they share one shutter."""
-        self._shutter.close()
 
 
 def open_vehicle(setup: Setup) -> SimVehicle:
@@ -193,9 +161,8 @@ def open_cameras(setup: Setup, vehicle: AnyVehicle) -> Sequence[Camera]:
     if not isinstance(world, SimWorld):
         raise BadInput("--cameras", "sim looks at the `world` of a vehicle, and this one lacks it")
     renderer = None
-    if choice(setup.options, "images", ("false", "true")) == "true":
+    if switch(setup.options, "images"):
         renderer = RenderingProcess(setup.rig, setup.markers, setup.seed)
     rate_hz = number(setup.options, "rate_hz", 30.0, 1.0, 240.0)
     clock = vehicle.waiting_clock if isinstance(vehicle, HasTime) else WaitingClock()
-    shutter = _Shutter(world, clock, rate_hz, renderer)
-    return [SimCamera(name, c, shutter) for c, name in enumerate(setup.rig.names)]
+    return _Shutter(world, clock, rate_hz, renderer, setup.rig.names).cameras

@@ -109,7 +109,7 @@ class SimWorld:
             self._written_ns = now_ns
 
     def carry_off(self, by: tuple[float, float, float]) -> None:
-        """Move the vehicle by (m, m, rad) in the world, as a person would."""
+        """Move the vehicle by (m, m, rad) in the world, as a person who carries it."""
         with self._lock:
             moved = self._row.copy()
             moved[:3] += np.array(by, self._dtype)
@@ -137,7 +137,7 @@ class SimWorld:
     def move_markers(
         self, by_m: tuple[float, float, float], which: slice = slice(None), scale: float = 1.0
     ) -> None:
-        """Somebody takes markers elsewhere, by so much in the world, or puts larger ones there."""
+        """Move markers by so much in the world, or scale them."""
         with self._lock:
             Ts = self.markers.Ts_world_marker
             moved = Ts.wxyz_xyz.at[which, 4:].add(jnp.asarray(by_m, Ts.wxyz_xyz.dtype)[None])
@@ -146,7 +146,7 @@ class SimWorld:
             self.markers = eqx.tree_at(lambda m: m.Ts_world_marker.wxyz_xyz, self.markers, moved)
 
     def copy_markers(self, by: tuple[float, float, float]) -> None:
-        """Somebody hangs up a copy of every marker, moved by (m, m, rad) about the origin."""
+        """Add a copy of every marker, moved by (m, m, rad) about the origin."""
         with self._lock:
             markers = self.markers
             Ts = markers.Ts_world_marker.wxyz_xyz
@@ -160,7 +160,7 @@ class SimWorld:
             )
 
     def knock_camera(self, camera: int, turn_rad: tuple[float, float, float]) -> None:
-        """Somebody turns a camera about its own axes, by a rotation vector."""
+        """Turn a camera about its own axes, by a rotation vector."""
         with self._lock:
             Ts = self.rig.Ts_camera_vehicle.wxyz_xyz
             turn = jaxlie.SE3.from_rotation(jaxlie.SO3.exp(jnp.asarray(turn_rad, Ts.dtype)))

@@ -22,7 +22,7 @@ def along(one, streak_px) -> float:
 
 def test_blurred_markers_are_acquired_where_another_renderer_draws_them():
     decoder, read, errors = make_detector("aruco", FAMILY), 0, []
-    pictures = [*other_pictures("blur4"), *other_pictures("blur8")]
+    pictures = [*other_pictures("blur4"), *other_pictures("blur8")][::3]
     for image, truth in pictures:
         read += truth.id in decoder.detect(image, truth.camera).ids
         found = Acquirer([(FAMILY, truth.id), *OTHERS]).detect(image, truth.camera)

@@ -12,18 +12,14 @@ import pytest
 
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.markers import FAMILY_SIZES, MarkerMap
-from jaxnav.detection import (
-    Detections,
-    make_detector,
-    marker_cells,
-    observe,
-)
+from jaxnav.detection import Detections, make_detector, marker_cells, observe
 from jaxnav.detection.lens import Lens
 from jaxnav.detection.observe import are_mirrored, double_area_px2
 from jaxnav.detection.read import read_marker
 from jaxnav.errors import BadInput
 from tests import worlds
 from tests.helpers.marker_images import Scene, random_scene, rotation
+from tests.helpers.other_pictures import SETS, other_pictures
 
 BACKENDS = ["aruco", "apriltag"]
 
@@ -51,17 +47,21 @@ def listed_markers(path):
 
 
 def test_photographs(detector, data_dir):
+    """OpenCV's decoder gives the outline of some from both sides of their edge: once is right."""
     listed = found = 0
     errors_px = []
     for photograph in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
         detections = detector.detect(cv2.imread(str(photograph)))
         # The field uses one id: anything else would be made up.
         assert set(detections.ids.tolist()) <= {0}
+        centers = detections.corners_px.mean(axis=1)
+        apart_px = np.linalg.norm(centers[:, None] - centers, axis=2)
+        assert np.min(apart_px + 1e3 * np.eye(len(centers))) > 8
         for marker_id, corners_px in listed_markers(photograph.with_suffix(".txt")):
             if np.linalg.norm(corners_px - np.roll(corners_px, 1, 0), axis=1).mean() < 20:
                 continue
             listed += 1
-            away = detections.corners_px.mean(axis=1) - corners_px.mean(axis=0)
+            away = centers - corners_px.mean(axis=0)
             here = (detections.ids == marker_id) & (np.linalg.norm(away, axis=1) < 3)
             if here.any():
                 found += 1
@@ -89,15 +89,6 @@ def test_one_sighting_is_not_two():
     assert len(Detections.concatenate([]).once_each()) == 0
 
 
-def test_photographs_have_no_marker_twice(detector, data_dir):
-    """OpenCV's decoder gives the outline of some from both sides of their edge."""
-    for photograph in sorted((data_dir / "apriltag_photos").glob("*.jpg")):
-        detections = detector.detect(cv2.imread(str(photograph)))
-        centers = detections.corners_px.mean(axis=1)
-        apart_px = np.linalg.norm(centers[:, None] - centers, axis=2)
-        assert np.min(apart_px + 1e3 * np.eye(len(centers))) > 8
-
-
 def small_scene(rng, side_px, blur_px):
     """The paper's marker from afar: upright, 39 degrees off its normal, before a patterned wall."""
     direction = rng.uniform(0, 2 * np.pi)
@@ -121,7 +112,11 @@ def small_scene(rng, side_px, blur_px):
 
 
 @pytest.mark.parametrize(
-    ("side_px", "blur_px", "needed"), [(14, 0, 12), (17, 0, 12), (17, 2, 12), (14, 2, 10)]
+    ("side_px", "blur_px", "needed"),
+    [
+        *(pytest.param(*case, marks=pytest.mark.long) for case in ((14, 0, 12), (17, 2, 12))),
+        (14, 2, 10),
+    ],
 )
 def test_small_markers_are_found_from_cold(side_px, blur_px, needed):
     detector = make_detector("aruco")
@@ -142,7 +137,7 @@ def test_small_markers_are_found_from_cold(side_px, blur_px, needed):
 def test_a_prediction_finds_what_a_cold_search_misses():
     detector = make_detector("aruco")
     cold = predicted = 0
-    for seed in range(16):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         scene = small_scene(rng, 20, 4.0)
         image, corners_px = scene.render(rng), scene.corners_px()
@@ -151,7 +146,7 @@ def test_a_prediction_finds_what_a_cold_search_misses():
         detections = detector.detect(image, predicted_corners_px=guess_px)
         predicted += len(detections)
         assert all(np.max(np.abs(c - corners_px)) < 0.5 for c in detections.corners_px)
-    assert predicted >= 12
+    assert predicted >= 6
     assert predicted >= cold
 
 
@@ -205,7 +200,7 @@ def test_nothing_is_found_where_nothing_is(detector):
 def test_frames_with_other_cells_are_not_read():
     rng = np.random.default_rng(4)
     read = 0
-    for _ in range(40):
+    for _ in range(20):
         cells = np.pad(rng.integers(0, 2, (6, 6)).astype(float), 1)
         scene = random_scene(rng, 20, cells, view_max_rad=0.6, optics_px=0.4)
         read += read_marker(scene.render(rng), scene.corners_px(), "tag36h11", Lens()) is not None
@@ -235,12 +230,10 @@ def test_corners_of_markers_that_do_not_matter_stay_as_they_are_decoded(backend,
     assert np.all(np.abs(off_px) < 3 * few.sigma_px[~few.refined].max())
 
 
-@pytest.mark.parametrize(
-    "image", [np.zeros((4, 5)), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5), np.uint8)]
-)
-def test_what_is_no_image_is_refused(detector, image):
-    with pytest.raises(BadInput, match="image"):
-        detector.detect(image)
+def test_what_is_no_image_is_refused(detector):
+    for image in (np.zeros((4, 5)), np.zeros((4, 5, 2), np.uint8), np.zeros((0, 5), np.uint8)):
+        with pytest.raises(BadInput, match="image"):
+            detector.detect(image)
 
 
 def test_unknown_names_are_refused(monkeypatch):
@@ -260,6 +253,40 @@ def test_unknown_names_are_refused(monkeypatch):
     monkeypatch.setattr(importlib, "import_module", without)
     with pytest.raises(BadInput, match=re.escape("pip install 'jaxnav[apriltag]'")):
         make_detector("apriltag")
+
+
+def test_clean_markers_are_found_where_another_renderer_drew_them():
+    detector = make_detector("aruco")
+    errors = []
+    for image, truth in other_pictures("clean"):
+        found = detector.detect(image)
+        assert found.ids.tolist() == [truth.id]
+        errors.append(found.corners_px[0] - truth.corners_px)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.05
+    assert np.abs(np.mean(errors, axis=(0, 1))).max() < 0.02  # no half pixel, nor a part of one
+
+
+def test_no_marker_is_read_where_there_is_none():
+    detector = make_detector("aruco")
+    for image, truth in other_pictures("negatives"):
+        shown = [truth.more["shown_id"]] if truth.more.get("shown_family") == truth.family else []
+        assert set(detector.detect(image).ids.tolist()) <= set(shown)
+
+
+@pytest.mark.parametrize("kind", SETS)
+def test_the_truth_agrees_with_itself(kind):
+    """The pose through the camera gives the corners; what is said of blur and sides holds."""
+    for image, truth in other_pictures(kind):
+        h = truth.size_m / 2
+        corners = np.array([[-h, h, 0, 1], [h, h, 0, 1], [h, -h, 0, 1], [-h, -h, 0, 1]])
+        x, y, z, _ = np.array(truth.more["T_camera_marker"]) @ corners.T
+        ahead = np.stack([x / z, y / z], axis=1)
+        seen = np.asarray(truth.camera.focal_px) * ahead + np.asarray(truth.camera.center_px)
+        np.testing.assert_allclose(seen, truth.corners_px, atol=1e-3)
+        blur_px = float(np.linalg.norm(truth.streak_px))
+        assert kind == "negatives" or abs(blur_px - {"blur4": 4, "blur8": 8}.get(kind, 0)) < 0.01
+        assert image.shape == (100, 120)
+        assert image.dtype == np.uint8
 
 
 def a_map(ids, families):

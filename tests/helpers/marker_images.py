@@ -4,12 +4,13 @@ renderer and detector; only the lens is the package's, through `Camera.unproject
 from dataclasses import dataclass
 
 import cv2
-import jax.numpy as jnp
+import equinox as eqx
 import numpy as np
 
 from jaxnav.core.models.camera import Camera
 
 SUBPIXELS = 8
+_project, _unproject = eqx.filter_jit(Camera.project), eqx.filter_jit(Camera.unproject)
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,8 @@ class Scene:
         """Where the corners are, (4, 2), TL TR BR BL."""
         h = self.size_m / 2
         corners = np.array([[-h, h, 0], [h, h, 0], [h, -h, 0], [-h, -h, 0]])
-        return np.asarray(
-            self.camera.project(
-                jnp.asarray(corners @ self.R_camera_marker.T + self.t_camera_marker)
-            )
-        )
+        in_camera = corners @ self.R_camera_marker.T + self.t_camera_marker
+        return np.asarray(_project(self.camera, in_camera))
 
     def render(self, rng: np.random.Generator) -> np.ndarray:
         """The image, (H, W) uint8."""
@@ -46,42 +44,43 @@ class Scene:
         k = SUBPIXELS
         u = ((np.arange(width * k) + 0.5) / k - 0.5).astype(np.float32)
         v = ((np.arange(height * k) + 0.5) / k - 0.5).astype(np.float32)
-        rays = self._rays(u, v).astype(np.float32)
-        # Ray and plane: the marker's own coordinates of the hit.
-        R, t = self.R_camera_marker.astype(np.float32), self.t_camera_marker.astype(np.float32)
-        along = rays @ R[:, 2]
-        depth = (R[:, 2] @ t) / np.where(along == 0, 1e-9, along)  # a ray along the paper
-        hit = (rays * depth[..., None] - t) @ R
+        # Ray and plane: the marker's own coordinates of the hit, in cells from the paper's corner.
+        x, y, ahead = self._along_marker(u, v)
+        tx, ty, depth = (self.R_camera_marker.T @ self.t_camera_marker).astype(np.float32)
+        depth = depth / np.where(ahead == 0, np.float32(1e-9), ahead)  # a ray along the paper
         n = len(self.cells)
-        column = np.floor((hit[..., 0] / self.size_m + 0.5) * n).astype(int)
-        row = np.floor((0.5 - hit[..., 1] / self.size_m) * n).astype(int)
-        inside = (column >= 0) & (column < n) & (row >= 0) & (row < n)
-        paper = (column >= -1) & (column <= n) & (row >= -1) & (row <= n) & (depth > 0)
-        cell = self.cells[np.clip(row, 0, n - 1), np.clip(column, 0, n - 1)]
-        ink = np.where(inside, self.black + (self.white - self.black) * cell, self.white)
-        ground = self.background + self.texture * cv2.resize(
-            rng.standard_normal((height // 3 + 1, width // 3 + 1)),
+        cell_m = np.float32(self.size_m / n)
+        column = np.where(depth > 0, (x * depth - tx) / cell_m + np.float32(n / 2 + 0.5), -9)
+        row = np.float32(n / 2 + 0.5) - (y * depth - ty) / cell_m
+        paper = np.pad(self.black + (self.white - self.black) * self.cells, 1,
+                       constant_values=self.white).astype(np.float32)  # fmt: skip
+        grain = rng.standard_normal((height // 3 + 1, width // 3 + 1)).astype(np.float32)
+        ground = cv2.resize(
+            self.background + self.texture * grain,
             (width * k, height * k),
             interpolation=cv2.INTER_NEAREST,
         )
-        image = np.where(paper, ink, ground).astype(np.float32)
+        image = cv2.remap(
+            paper, column, row, cv2.INTER_NEAREST, dst=ground, borderMode=cv2.BORDER_TRANSPARENT
+        )
         image = self._blur(image, k)
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
         image = image + self.noise * rng.standard_normal(image.shape)
         return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
-    def _rays(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def _along_marker(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The rays through columns u and rows v along the marker's three axes, (V, U) each."""
+        R = self.R_camera_marker.astype(np.float32)
         if self.camera.lenses == ("none",):
-            focal, center = np.asarray(self.camera.focal_px), np.asarray(self.camera.center_px)
-            xy = (np.stack(np.meshgrid(u, v), axis=-1) - center) / focal
-            return np.concatenate([xy, np.ones_like(xy[..., :1])], axis=-1)
+            (fx, fy), (cx, cy) = np.asarray(self.camera.focal_px), np.asarray(self.camera.center_px)
+            x, y = ((u - cx) / fx).astype(np.float32), ((v - cy) / fy).astype(np.float32)
+            return tuple(x * R[0, i] + (y * R[1, i] + R[2, i])[:, None] for i in range(3))
         # Exact at whole pixels; between them a lens is linear to a thousandth of a pixel.
         width, height = self.size_px
         grid = np.stack(np.meshgrid(np.arange(-1, width + 1), np.arange(-1, height + 1)), axis=-1)
-        rays = np.asarray(self.camera.unproject(jnp.asarray(grid, float)))
-        return np.einsum(
-            "vi,ijc,uj->vuc", _linear(v, height), rays, _linear(u, width), optimize=True
-        )
+        rays = np.asarray(_unproject(self.camera, grid.astype(float)))
+        across, down = _linear(u, width), _linear(v, height)
+        return tuple(np.float32(down @ (rays @ R[:, i]) @ across.T) for i in range(3))
 
     def _blur(self, image: np.ndarray, k: int) -> np.ndarray:
         length = float(np.hypot(*self.motion_px))

@@ -38,12 +38,12 @@ def found(outliers: int) -> OdometryCalibration:
 def test_every_panel_is_labelled_and_the_advice_is_there():
     corners_world_m = np.asarray(worlds.paper_markers().corners_world_m)
     figure = odometry_report(found(5), corners_world_m, "speed_scale 1.0")
-    drive, residuals, told, readings = figure.axes
+    drive, residuals, table, readings = figure.axes
     for axes in (drive, residuals, readings):
         assert "(" in axes.get_xlabel()
         assert "(" in axes.get_ylabel()
     assert drive.get_aspect() == 1.0
-    texts = " ".join(text.get_text() for text in told.texts)
+    texts = " ".join(text.get_text() for text in table.texts)
     assert "speed_scale 1.0" in texts
     assert "full lock both ways" in " ".join(texts.split())
     assert "counts less" in residuals.get_legend_handles_labels()[1]

@@ -41,13 +41,8 @@ def run(args: Arguments) -> int:
         f"{name}: {summary['pairs']} pairs, {summary['flipped_fraction']:.2%} flipped, "
         f"expected calibration error {reliability.expected_calibration_error:.4f}"
     )
-    diagram = reliability_diagram(
-        reliability.predicted,
-        reliability.observed,
-        reliability.intervals,
-        reliability.counts,
-        title=text,
-    )
+    curve = reliability.predicted, reliability.observed, *reliability.intervals, reliability.counts
+    diagram = reliability_diagram({"observed": curve}, title=text)
     write_report(out, summary, [text, f"diagram in {visible(out)}"], reliability=diagram)
     return 0
 

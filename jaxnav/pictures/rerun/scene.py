@@ -5,7 +5,7 @@
     plots/...                 numbers over time; the cameras' errors in units of their prior's sigma
     health                    a line where health, faults or rejects change
 
-Rerun stores positions in float32, so they count from the origin of the map; `health` tells the
+Rerun stores positions in float32, so they count from the origin of the map; `health` names the
 origin if it is not the world's zero.
 
 Images of a wide lens are shown as a pinhole's: they are curved where Rerun draws straight lines.
@@ -177,7 +177,7 @@ class RerunScene:
         Ts = [poses.inverse(T) for T in Ts_vehicle_map if np.isfinite(T).all()]
         arrows = self._rerun.Arrows3D(
             origins=[T[4:] for T in Ts],
-            vectors=[_ARROW_M * _x_axis(T[:4]) for T in Ts],
+            vectors=[poses.rotated(T[:4].tolist(), [_ARROW_M, 0.0, 0.0]) for T in Ts],
             colors=[_rgb(BLUE if index == selected else ORANGE) for index in range(len(Ts))],
             radii=0.006,
         )
@@ -270,9 +270,3 @@ def _closed(corners: np.ndarray) -> list[np.ndarray]:
 def _on_floor(places: np.ndarray) -> np.ndarray:
     """Points (N, 2) with a third coordinate of 0."""
     return np.column_stack([places, np.zeros(len(places))])
-
-
-def _x_axis(wxyz: np.ndarray) -> np.ndarray:
-    """The x axis of a rotated frame."""
-    w, x, y, z = wxyz
-    return np.array([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)])

@@ -37,6 +37,7 @@ APPLICATION = "jaxnav"
 _IDLE_S = 0.02  # between looks at an empty queue
 _START_S = 20.0  # for the viewer's window to be there
 _FLUSH_S = 5.0
+_MOST_QUEUED = 200  # outcomes and images
 # Drawing an outcome takes 4 ms of the interpreter, which the driving thread needs as well.
 _PERIOD_NS = 100_000_000
 
@@ -61,7 +62,6 @@ class RerunView:
         live: bool,
         save: Path | None,
         waits: bool = False,
-        queue_items: int = 200,
     ):
         """Args:
         rig: None if unknown.
@@ -70,7 +70,6 @@ class RerunView:
         live: open a window.
         save: an .rrd file to write.
         waits: whether `show` and `image` wait for the drawing, so that nothing is dropped.
-        queue_items: the most outcomes and images in the queue.
 
         Raises:
             BadInput: Rerun is not installed, its window does not open, the file can't be written.
@@ -89,7 +88,7 @@ class RerunView:
         self._stream.set_sinks(*sinks)
         self._scene = RerunScene(rerun, self._stream, rig, markers, waypoints_m)
         self._waits = waits
-        self._queue: queue.Queue[Callable[[RerunScene], None]] = queue.Queue(queue_items)
+        self._queue: queue.Queue[Callable[[RerunScene], None]] = queue.Queue(_MOST_QUEUED)
         self._closing = threading.Event()
         self._lock = threading.Lock()  # for the count
         self.dropped = 0

@@ -3,8 +3,7 @@
     for row in MATRIX:
         print(line(run_trial(row, trial)))
 
-All faults act on corners, in lockstep drives of the simulated car, or of another base, through a
-loop of waypoints.
+All faults act on corners, in lockstep drives of a simulated vehicle through a loop of waypoints.
 Faults of images are tested with the search of frames, threads and signals with the loop.
 """
 
@@ -36,7 +35,7 @@ from jaxnav.vehicles.world import SimWorld, WorldSettings
 BEGIN_S, END_S = 2.5, 4.0  # of most faults
 ALL_CAMERAS = range(4)  # of the trial's rig
 SETTLE_S = 2.0  # this long after a fault the position must be right again
-# Whoever is farther off than this, and drives on at health OK, lies: a stranger's hand or shin.
+# A vehicle that is farther off than this and drives on at health OK counts as lying.
 LIE_M = 0.5
 WAYS = ("lied_m", "named_m", "slow_m", "stood_m")
 WAYPOINTS_M = (
@@ -63,7 +62,7 @@ class FaultRow:
         begins_s, ends_s: of the fault; inf: it lasts.
         always: the data are changed before `begins_s` too.
         drive_s: duration of the whole drive.
-        telling, mapped: make the rig and the map of the navigator's files from the true ones.
+        rig_file, map_file: make what the files say of the rig and of the map from the true ones.
         markers: makes the drive's markers from the trial's.
         relocate: see `Pilot`.
         well: the worst health at which the car has recovered.
@@ -86,8 +85,8 @@ class FaultRow:
     always: bool = False
     drive_s: float = 7.0
     rates: Rates = field(default_factory=Rates)
-    telling: Callable[[CameraRig], CameraRig] = lambda rig: rig
-    mapped: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
+    rig_file: Callable[[CameraRig], CameraRig] = lambda rig: rig
+    map_file: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     markers: Callable[[MarkerMap], MarkerMap] = lambda markers: markers
     relocate: bool = True
     well: Health = Health.OK
@@ -157,8 +156,8 @@ def run_trial(row: FaultRow, trial: Trial) -> Result:
     trial = dataclasses.replace(trial, markers=row.markers(trial.markers))
     markers, route = shift_origin(trial, row.shift_m)
     navigator = Navigator(
-        rig=row.telling(trial.rig),
-        markers=row.mapped(markers),
+        rig=row.rig_file(trial.rig),
+        markers=row.map_file(markers),
         vehicle=trial.vehicle,
         waypoints_m=route.waypoints_m,
         waypoint_radius_m=route.waypoint_radius_m,
@@ -264,33 +263,33 @@ def _error_m(step: Step) -> float:
 
 
 def _broken(result: Result, steps: list[Step], pilot: Pilot) -> list[str]:
-    row, said = result.row, []
+    row, broken = result.row, []
     if row.faults and not result.faults & row.faults:
-        said.append(f"no {'/'.join(names(row.faults))}")
+        broken.append(f"no {'/'.join(names(row.faults))}")
     if row.rejects and not result.rejects & row.rejects:
-        said.append(f"no {'/'.join(names(row.rejects))}")
+        broken.append(f"no {'/'.join(names(row.rejects))}")
     if not row.health[0] <= result.worst <= row.health[1]:
-        said.append(f"health {result.worst.name}")
+        broken.append(f"health {result.worst.name}")
     if result.error_m > row.error_m:
-        said.append(f"error {result.error_m:.3f} m")
+        broken.append(f"error {result.error_m:.3f} m")
     if result.error_after_m > row.error_after_m:
-        said.append(f"error afterwards {result.error_after_m:.3f} m")
+        broken.append(f"error afterwards {result.error_after_m:.3f} m")
     if math.isfinite(row.ends_s) and result.recovered_s > SETTLE_S:
-        said.append(f"recovered after {result.recovered_s:.1f} s")
+        broken.append(f"recovered after {result.recovered_s:.1f} s")
     for name, way_m in result.ways_m.items():
         if way_m > getattr(row, name):
-            said.append(f"{name} {way_m:.2f}")
+            broken.append(f"{name} {way_m:.2f}")
     limits = pilot.limits
     for step in steps:
         command = step.outcome.command
         if limits.within(command, command, 0.0) != command:
-            said.append(f"command {', '.join(map(str, command))}")
+            broken.append(f"command {', '.join(map(str, command))}")
             break
         stands = limits.standing(command) == command
         if step.outcome.health in (Health.STOP, Health.INIT) and not stands:
-            said.append("drives in STOP")
+            broken.append("drives in STOP")
             break
-    return said
+    return broken
 
 
 HEADER = (

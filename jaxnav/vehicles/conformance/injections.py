@@ -69,11 +69,6 @@ def corners(edit: Callable[[Float[np.ndarray, "N 4 2"]], Float[np.ndarray, "N 4 
     return detections(field("corners_px", edit))
 
 
-def stamps(edit: Callable[[int], int]) -> EditFrame:
-    """Edit the stamps of frames."""
-    return field("stamp_ns", edit)
-
-
 def doubled(shift_px: float) -> EditFrame:
     """Show every marker once more, so far away."""
 
@@ -97,9 +92,10 @@ def random_corners() -> Change:
     return frames(corners(lambda c: rng.uniform([0, 0], [820, 410], c.shape)))
 
 
-def nothing_seen(frame: FrameDetections) -> FrameDetections:
-    """Make a frame show no marker: a tunnel, a black or a white image."""
-    return dataclasses.replace(frame, detections=Detections.concatenate([]))
+# Frames that show no marker: a tunnel, a black or a white image.
+nothing_seen = field("detections", lambda _: Detections.concatenate([]))
+# The driver says of a reading that it is none.
+invalid = field("valid", lambda _: False)
 
 
 def unusable(frame: FrameDetections) -> FrameDetections:
@@ -180,12 +176,7 @@ def drifting_clocks() -> Change:
     def drifting(ns: int) -> int:
         return ns + int((ns - BEGIN_NS) * 100e-6)
 
-    return both(frames(stamps(drifting)), odometry(field("stamp_ns", drifting)))
-
-
-def invalid(reading: Odometry) -> Odometry:
-    """Say of a reading that it is invalid."""
-    return dataclasses.replace(reading, valid=False)
+    return both(frames(field("stamp_ns", drifting)), odometry(field("stamp_ns", drifting)))
 
 
 def spiking() -> EditOdometry:

@@ -44,7 +44,7 @@ def _corners(edit: Callable[[np.ndarray], np.ndarray]) -> Make:
 
 
 def _stamps(edit: Callable[[int], int]) -> Make:
-    return _frames(inject.stamps(edit))
+    return _frames(inject.field("stamp_ns", edit))
 
 
 def _frozen(cameras: range, jitter_px: float = _JITTER_PX) -> Make:
@@ -236,11 +236,11 @@ def _wired(
     reads: Callable[[Numbers, Numbers], Numbers] | None,
     *bases: str,
 ) -> list[FaultRow]:
-    """Rows in which a command moves the vehicle otherwise than it says.
+    """Rows in which an actuator does something else than the command.
 
-    One with an odometer that tells the truth, from some time on, and one from the start with one
-    that tells what was commanded: it is wired in the same way, or there is none on that part. Such
-    an odometer also makes the filter restart, which may stop the vehicle before the part is named.
+    In one the odometer is right and the fault comes later; in the other, from the start, it reads
+    what was commanded: it is wired in the same way, or there is none on that part. Such an odometer
+    also makes the filter restart, which may stop the vehicle before the part is named.
 
     The way that is allowed holds half a metre on which the part is used; before it lie 0.35 m that
     are straight, and from the start 0.75 m that the pose is undecided on and 0.35 m more.
@@ -372,11 +372,11 @@ MATRIX: tuple[FaultRow, ...] = (
     ),
     _stops("blind and without odometry", lambda: inject.neither, Fault.CAMERAS_STALE, error_m=0.30),
     # Calibration and world.
-    _wrong_file("cameras off by 1 deg, 1 cm", telling=_moved(_off_by_hand)),
-    _wrong_file("focal length off by 2 %", telling=_focal(1.02)),
+    _wrong_file("cameras off by 1 deg, 1 cm", rig_file=_moved(_off_by_hand)),
+    _wrong_file("focal length off by 2 %", rig_file=_focal(1.02)),
     _may_stop(
         "cameras swapped",
-        telling=_swapped(0, 3, 2, 1),
+        rig_file=_swapped(0, 3, 2, 1),
         # One that shares its view with another is outvoted; one that is alone looks right.
         faults=Fault.CAMERA_OUTVOTED | Fault.RESTARTED,
         error_m=math.inf,
@@ -414,15 +414,15 @@ MATRIX: tuple[FaultRow, ...] = (
         happens=_at(_FROM_START, lambda world: world.copy_markers((2.0, -1.6, np.pi))),
         faults=Fault.DUPLICATE_MARKER,
     ),
-    _named_soon("marker size x2", mapped=_sized(2.0)),
-    _named_soon("marker size x0.5", mapped=_sized(0.5)),
-    _named("marker size x1.2", mapped=_sized(1.2), lied_m=1.0, named_m=1.5),
-    _named("marker size x0.8", mapped=_sized(0.8), lied_m=1.0, named_m=1.5),
-    _named_soon("focal length x1.5", telling=_focal(1.5)),
-    _named_soon("focal length x0.7", telling=_focal(0.7)),
-    _named_turned("front and rear camera swapped", telling=_swapped(2, 1, 0, 3)),
+    _named_soon("marker size x2", map_file=_sized(2.0)),
+    _named_soon("marker size x0.5", map_file=_sized(0.5)),
+    _named("marker size x1.2", map_file=_sized(1.2), lied_m=1.0, named_m=1.5),
+    _named("marker size x0.8", map_file=_sized(0.8), lied_m=1.0, named_m=1.5),
+    _named_soon("focal length x1.5", rig_file=_focal(1.5)),
+    _named_soon("focal length x0.7", rig_file=_focal(0.7)),
+    _named_turned("front and rear camera swapped", rig_file=_swapped(2, 1, 0, 3)),
     _named_turned(
-        "rig turned by 180 deg", telling=_moved(lambda _: np.array([0, 0, 0, 0, 0, np.pi]))
+        "rig turned by 180 deg", rig_file=_moved(lambda _: np.array([0, 0, 0, 0, 0, np.pi]))
     ),
     # Something stands still while others move, or rates matter.
     _may_slow("frozen images, found anew", _frozen(ALL_CAMERAS), Fault.FRAME_FROZEN),

@@ -1,6 +1,7 @@
 """Check the promises of a vehicle one by one."""
 
 import contextlib
+import dataclasses
 import math
 import statistics
 import threading
@@ -218,10 +219,8 @@ def _check_reading(reading: object, kind: type[Odometry] | type[TwistOdometry]) 
     check_stamp(f"{article} {name}", reading.stamp_ns)
     if not reading.valid:
         return
-    of_car = "speed_mps", "steering_rad"
-    fields = of_car if kind is Odometry else ("forward_mps", "left_mps", "turn_radps")
-    for field in fields:
-        value = getattr(reading, field)
+    fields = [one.name for one in dataclasses.fields(kind)[1:-1]]
+    for field, value in zip(fields, reading.values, strict=True):
         good = isinstance(value, int | float | np.floating) and math.isfinite(value)
         assert good, f"{field} of a valid {name} must be a finite number, not {value!r}"
 

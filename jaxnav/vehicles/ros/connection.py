@@ -60,14 +60,14 @@ class Connection:
         """Enter ROS.
 
         Args:
-            sim_time: whether time is that of /clock; the words may say so too.
+            sim_time: whether time is that of /clock; `args` may say so too.
             ros_time: whether times are those of ROS; with `sim_time` they always are.
             make_node: called with name and context instead of `rclpy.create_node`.
-            args: words of the command line for ROS.
+            args: arguments of the command line for ROS.
 
         Raises:
             ImportError: ROS 2 is not there.
-            OSError: ROS 2 can't start, or does not understand the words.
+            OSError: ROS 2 can't start, or does not understand the arguments.
         """
         import rclpy
         from rclpy.parameter import Parameter
@@ -78,7 +78,7 @@ class Connection:
         self.contained = Containment()
         self._context = rclpy.Context()
         try:
-            with libraries_silenced():  # what is wrong with the words is in the exception too
+            with libraries_silenced():  # the exception says the same
                 rclpy.init(
                     args=args, context=self._context, signal_handler_options=SignalHandlerOptions.NO
                 )
@@ -99,7 +99,7 @@ class Connection:
         """A publisher on a topic, for `publish`.
 
         Args:
-            latched: who listens later hears the last message too.
+            latched: later subscribers get the last message too.
         """
         from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -142,14 +142,14 @@ class Connection:
         kind: str,
         name: str,
         answer: Callable[..., Any],
-        beside: Callable[[Any], Any] | None = None,
+        prepare: Callable[[Any], Any] | None = None,
     ) -> None:
         """Answer a service whose response has `success` and `message`, in the thread of `run`.
 
         Args:
             answer: returns the response to a request, once it is filled in; what it raises is said
                 there.
-            beside: what takes seconds: it is called first, with the request, in a thread of its
+            prepare: what takes seconds: it is called first, with the request, in a thread of its
                 own, while others are called back; `answer` gets its result too.
 
         Raises:
@@ -158,9 +158,9 @@ class Connection:
 
         async def answered(request: Any, response: Any) -> Any:
             try:
-                if beside is None:
+                if prepare is None:
                     return answer(request, response)
-                return answer(request, response, await self._result(partial(beside, request)))
+                return answer(request, response, await self._result(partial(prepare, request)))
             except BadInput as bad:
                 response.success, response.message = False, str(bad)
             except Exception as error:
@@ -244,7 +244,7 @@ class Connection:
             else:
                 future.set_result(result)
 
-        threading.Thread(target=work, name="beside ROS", daemon=True).start()
+        threading.Thread(target=work, name="ROS service", daemon=True).start()
         return future
 
     def _run(self) -> None:

@@ -133,7 +133,7 @@ class OdomTf:
         stamp_ns = link.clock.time_ns(stamped.header.stamp)
         last_ns = link.held[-1][0] if link.held else None
         if last_ns is not None and (is_static or stamp_ns < last_ns - _STALE_NS):
-            link.held.clear()  # said anew, or its clock was set back
+            link.held.clear()  # sent again, or its clock was set back
         elif last_ns is not None and stamp_ns <= last_ns:
             return
         link.held.append((stamp_ns, pose))

@@ -1,7 +1,7 @@
 """Publish outcomes to ROS: tf, pose, odometry, the bank, diagnostics, pictures for RViz.
 
-What others steer by (tf, pose, odometry) is sent at once. All else is sent by a thread that takes
-the latest outcome when it has time.
+What other nodes control by (tf, pose, odometry) is sent at once. All else is sent by a thread that
+takes the latest outcome when it has time.
 """
 
 import importlib.util
@@ -65,7 +65,7 @@ class Publisher:
     ):
         """Args:
         odom: what map -> odom completes; None: map -> base is sent.
-        tolerance_s: tf is stamped so far in the future, for who asks about the present.
+        tolerance_s: tf is stamped so far in the future, for nodes that ask about the present.
         base_x_m: where the base is on the vehicle, forward of the middle between its axles.
         """
         self._connection, self._frames, self._odom = connection, frames, odom
@@ -110,7 +110,7 @@ class Publisher:
             self._send_pose(outcome)
 
     def show_map(self, markers: MarkerMap) -> None:
-        """Send a picture of the map to whoever listens, now or later. Raises nothing."""
+        """Send a picture of the map to all subscribers, later ones too. Raises nothing."""
         self._send_map(markers)
 
     def close(self) -> None:

@@ -1,8 +1,8 @@
 """Convert the stamps of one topic to the clock of the program.
 
-A source whose stamps are of this computer's clock is believed from then on: stamps that repeat,
-stand still or jump stay what they are, and the pilot refuses them. Stamps of another computer's
-clock, and missing ones, say nothing: there the time is that of arrival.
+Once a source has given stamps of this computer's clock they are used as they are: those that repeat
+or jump are left for the pilot to refuse. For stamps of another computer's clock, and missing ones,
+the time is that of arrival.
 """
 
 import time

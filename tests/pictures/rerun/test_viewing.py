@@ -12,17 +12,20 @@ import sys
 import threading
 import time
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import yaml
 
 from jaxnav import cli
+from jaxnav.core.models.vehicle import SENSOR_ERRORS, TWIST_ERRORS
 from jaxnav.drive.flags import Health
 from jaxnav.drive.history import EventData
 from jaxnav.errors import BadInput
 from jaxnav.files import calib_dir
 from jaxnav.pictures.rerun import view as viewing
+from jaxnav.pictures.rerun.scene import RerunScene
 from jaxnav.pictures.rerun.view import RerunView
 from jaxnav.pictures.scenery import Scenery
 from jaxnav.recordings.drive_log import read_drive
@@ -133,7 +136,8 @@ def test_nobody_waits_and_what_does_not_fit_is_counted(tmp_path, monkeypatch):
         go_on.wait(10)
 
     monkeypatch.setattr(viewing.RerunScene, "show", slow)
-    view = opened(tmp_path / "drive.rrd", queue_items=3)
+    monkeypatch.setattr(viewing, "_MOST_QUEUED", 3)
+    view = opened(tmp_path / "drive.rrd")
     far_apart = range(0, 400, 20)
     view.show(make_outcome(0))
     assert begun.wait(10)
@@ -186,8 +190,8 @@ def stand_in(monkeypatch, script: str) -> None:
 
 
 def test_a_window_that_is_closed_is_noticed_and_the_drive_goes_on(monkeypatch, tmp_path):
-    told = tmp_path / "environment"
-    write = f"import json, os; json.dump(dict(os.environ), open({str(told)!r}, 'w')); "
+    written = tmp_path / "environment"
+    write = f"import json, os; json.dump(dict(os.environ), open({str(written)!r}, 'w')); "
     stand_in(monkeypatch, write + LISTENS + "s.accept(); time.sleep(0.5)")
     monkeypatch.setattr(viewing, "_FLUSH_S", 0.2)
     view = opened(None, live=True)
@@ -202,7 +206,7 @@ def test_a_window_that_is_closed_is_noticed_and_the_drive_goes_on(monkeypatch, t
     view.show(make_outcome(index))
     assert view.dropped == dropped + 1
     view.close()
-    environment = json.loads(told.read_text())
+    environment = json.loads(written.read_text())
     # What Rerun takes as a wish to send no usage data.
     assert (environment["CI"], environment["FORCE_RERUN_ANALYTICS"]) == ("true", "0")
 
@@ -241,3 +245,24 @@ def test_files_that_can_not_be_read_or_written_get_one_line(recorded, tmp_path, 
         assert (out, err.count("\n")) == ("", 1)
     with pytest.raises(BadInput, match=r"a.rrd: can't be written: not a directory"):
         opened(tmp_path / "file" / "a.rrd")
+
+
+def test_a_base_shows_its_twist_and_a_car_its_throttle():
+    """And the names of their sensors' errors."""
+    of_base = {"plots/forward_mps", "plots/left_mps", "plots/turn_radps"}
+    of_car = {"plots/throttle", "plots/steering_rad"}
+    car, base = make_outcome(1), dataclasses.replace(make_outcome(1), twist=(0.1, 0.2, 0.3))
+    for outcome, shown, hidden, errors in (
+        (base, of_base, of_car, [SENSOR_ERRORS, TWIST_ERRORS]),
+        (car, of_car, of_base, [SENSOR_ERRORS]),
+    ):
+        rerun, stream = MagicMock(), MagicMock()
+        scene = RerunScene(rerun, stream, None, None, np.zeros((0, 2)))
+        for _ in range(2):
+            scene.show(Outcomes.from_outcome(outcome), 0)
+        plots = {call.args[0] for call in stream.log.call_args_list}
+        assert shown <= plots
+        assert not hidden & plots
+        assert [call.kwargs["names"] for call in rerun.SeriesLines.call_args_list] == [
+            list(names) for names in errors
+        ]
