@@ -28,10 +28,9 @@ from tests.helpers.strangers import Stranger, jaxnav
 
 @dataclass(frozen=True)
 class Driven:
-    """A recorded drive, what it printed, and what the vehicle was told where."""
+    """A recorded drive, and what the vehicle was told where."""
 
     path: Path
-    out: str
     told: list[Word]
 
     def off(self, log: DriveLog) -> tuple[np.ndarray, np.ndarray]:
@@ -48,28 +47,19 @@ class Driven:
         return np.hypot(pose[:, 0] - x_m, pose[:, 1] - y_m), np.abs(turn_rad)
 
 
-def drive(stranger: Stranger, name: str, *arguments: object) -> Driven:
-    """One that arrives, with a watchdog that is patient with a busy machine."""
-    path, told = stranger.folder / f"{name}.mcap", stranger.folder / f"{name}.told"
+@pytest.fixture(scope="module")
+def driven(stranger) -> Driven:
+    """By rendered images, which are recorded, with a watchdog that is patient with a busy
+    machine."""
+    path, told = stranger.folder / "a drive.mcap", stranger.folder / "a drive.told"
     ended = jaxnav(
         stranger.folder, "run", *stranger.flags(), "--car", recorded_vehicle.NAME,
-        "--cameras", "sim", "--option", f"log={told}", "--record", path, "--timeout-s", 3,
-        "--duration-s", 90, "--headless", *arguments,
+        "--cameras", "sim", "--option", f"log={told}", "--option", "images=true",
+        "--record", path, "--record-images", "--timeout-s", 3, "--duration-s", 90, "--headless",
     )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout.startswith("ended: arrived\n")
-    return Driven(path, ended.stdout, words(told))
-
-
-@pytest.fixture(scope="module")
-def driven(stranger) -> Driven:
-    return drive(stranger, "a drive")
-
-
-@pytest.fixture(scope="module")
-def pictured(stranger) -> Driven:
-    """By rendered images, which are recorded."""
-    return drive(stranger, "a film", "--option", "images=true", "--record-images")
+    return Driven(path, words(told))
 
 
 @pytest.fixture(scope="module")
@@ -111,44 +101,31 @@ def test_it_arrives_where_it_thinks(stranger, driven):
     off_m, off_rad = driven.off(log)
     half = len(off_m) // 2
     assert half > 20
-    assert np.median(off_m[half:]) < 0.03
+    assert np.median(off_m[half:]) < 0.05
     assert off_m[-1] < 0.05
-    assert np.rad2deg(np.median(off_rad[half:])) < 2
+    assert np.rad2deg(np.median(off_rad[half:])) < 3
     assert driven.told[-1].throttle == 0
     twist = log.outcomes.twist
     assert twist[-1].tolist() == [0.0, 0.0, 0.0]
     assert np.abs(twist[:, 1]).max() > 0.1 if len(stranger.cameras) > 1 else not twist[:, 1].any()
     readings = sum(len(given.gyro) for given in log.inputs)
     assert readings > 50 if len(stranger.cameras) > 1 else readings == 0
-
-
-def test_it_arrives_by_its_images(stranger, pictured):
-    log = read_drive(pictured.path)
-    off_m, off_rad = pictured.off(log)
-    half = len(off_m) // 2
-    assert np.median(off_m[half:]) < 0.05
-    assert np.rad2deg(np.median(off_rad[half:])) < 3
     seen = [one.detections for given in log.inputs for one in given.frames if one.detections]
     assert {name for one in seen for name in one.families} == {stranger.family}
     shown = {image.topic for image in log.images()}
     assert shown == {f"/camera/{name}" for name in stranger.cameras}
 
 
-def test_its_drive_replays_to_the_same_bits(stranger, driven, tmp_path):
-    ended = jaxnav(stranger.folder, "replay", driven.path, "--out", tmp_path, "--headless")
-    assert (ended.returncode, ended.stderr) == (0, "")
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["bit_for_bit"]
-    assert summary["compared"] > 50
-
-
-def test_its_images_are_searched_once_more(stranger, pictured, tmp_path):
-    ended = jaxnav(
-        stranger.folder, "replay", pictured.path, "--images", "--limit", 200, "--out", tmp_path,
-        "--headless",
-    )  # fmt: skip
-    assert (ended.returncode, ended.stderr) == (0, "")
-    summary = json.loads((tmp_path / "summary.json").read_text())
+def test_its_drive_replays_to_the_same_bits_and_its_images_are_searched_once_more(
+    stranger, driven, tmp_path
+):
+    for more in ((), ("--images", "--limit", 60)):
+        ended = jaxnav(
+            stranger.folder, "replay", driven.path, *more, "--out", tmp_path, "--headless"
+        )
+        assert (ended.returncode, ended.stderr) == (0, "")
+        summary = json.loads((tmp_path / "summary.json").read_text())
+        assert more or (summary["bit_for_bit"] and summary["compared"] > 50)
     assert summary["decided_share"] > 0.2
 
 
@@ -167,9 +144,9 @@ def test_its_drive_is_drawn(driven, here, tmp_path):
     assert drawn(tmp_path / "drive.png")
 
 
-def test_its_drive_is_shown(pictured, here, tmp_path):
+def test_its_drive_is_shown(driven, here, tmp_path):
     pytest.importorskip("rerun")
-    code, _, err = here("view", pictured.path, "--out", tmp_path / "a view.rrd", "--headless")
+    code, _, err = here("view", driven.path, "--out", tmp_path / "a view.rrd", "--headless")
     assert (code, err) == (0, "")
     assert (tmp_path / "a view.rrd").stat().st_size > 50_000
 

@@ -34,18 +34,22 @@ BENT = {
 }
 SMALL, USUAL, LARGE = (160, 120), (820, 410), (1280, 720)
 # Programs differ by the number of cells, of codes and the kind of lens, and nothing else: each
-# family and each lens is there. Those of `follow` take seconds each to compile: two kinds, and that
-# of the last test.
+# family and each lens is there.
 KINDS = [
     # family, lens, markers, cameras, size, backend, follow
-    ("tag16h5", "radtan", 2, 1, LARGE, "aruco", True),
+    ("tag16h5", "radtan", 2, 1, LARGE, "aruco", False),
     ("tag25h9", "double_sphere", 5, 2, SMALL, "aruco", False),
-    ("tag36h11", "omni", 1, 4, USUAL, "apriltag", True),
+    ("tag36h11", "omni", 1, 4, USUAL, "apriltag", False),
     ("7x7_50", "none", 2, 2, LARGE, "aruco", False),
     ("aruco_mip_36h12", "eucm", 1, 1, SMALL, "aruco", False),
     ("tag25h9", "thin_prism", 5, 4, LARGE, "apriltag", False),
     ("4x4_50", "rational", 1, 2, USUAL, "aruco", False),
     ("tag16h5", "equidistant", 1, 1, USUAL, "apriltag", False),
+]
+# Those of `follow` take long to compile: in `make test` they are those of the last test.
+FOLLOWING = [
+    pytest.param("tag16h5", "radtan", 2, 1, LARGE, "aruco", True, marks=pytest.mark.long),
+    pytest.param("tag36h11", "omni", 1, 4, USUAL, "apriltag", True, marks=pytest.mark.long),
 ]
 OTHERS = sorted(FAMILY_SIZES.keys() - {family for family, *_ in KINDS})
 
@@ -127,7 +131,7 @@ def look_at_all(
 
 @pytest.mark.parametrize("precision", ["float32"], indirect=True)
 @pytest.mark.parametrize(
-    ("family", "lens", "markers", "cameras", "size_px", "backend", "follow"), KINDS
+    ("family", "lens", "markers", "cameras", "size_px", "backend", "follow"), KINDS + FOLLOWING
 )
 def test_a_warm_search_calls_no_program_for_the_first_time(
     precision, family, lens, markers, cameras, size_px, backend, follow

@@ -18,14 +18,17 @@ from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.recordings.records import digest
 from jaxnav.sim.bases import equipped
 from jaxnav.vehicles.conformance import injections as inject
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Step, drive
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers.simulated import record
 
-ROUTE = Route(((1.30, 0.0), (0.50, 0.65)), 0.15, worlds.START_VIEW)
+# As many waypoints as the fault matrix has, whose program does for these drives as well.
+COUNT = len(WAYPOINTS_M)
+ROUTE = Route(((1.30, 0.0), *[(0.50, 0.65)] * (COUNT - 1)), 0.15, worlds.START_VIEW)
 # Behind it: it turns on the spot, away from the marker.
-BEHIND = Route(((2.6, -1.9),), 0.15, worlds.START_VIEW)
+BEHIND = Route(((2.6, -1.9),) * COUNT, 0.15, worlds.START_VIEW)
 
 
 def base() -> TwistBase:
@@ -140,8 +143,8 @@ def repeated(*case):
 @pytest.mark.parametrize(
     ("edit", "faults"),
     [
-        (lambda one: [], Fault.GYRO_STALE),
-        (with_rate(math.nan), Fault.GYRO_INVALID | Fault.GYRO_STALE),
+        repeated(lambda one: [], Fault.GYRO_STALE),
+        repeated(with_rate(math.nan), Fault.GYRO_INVALID | Fault.GYRO_STALE),
         repeated(with_rate(-math.inf), Fault.GYRO_INVALID | Fault.GYRO_STALE),
         repeated(with_rate(math.radians(2000.0)), Fault.GYRO_INVALID | Fault.GYRO_STALE),
         (with_rate(-0.25), Fault.GYRO_INVALID | Fault.GYRO_STALE),  # it repeats itself

@@ -120,8 +120,14 @@ def test_what_a_stage_found_in_its_last_step_is_written(tmp_path):
     assert_same(written(tmp_path), SPACE.values(fit.best_x))
 
 
-@pytest.mark.parametrize("changes", [{"stages": 2, "steps": 40}, NOISY], ids=["smooth", "noisy"])
-@pytest.mark.parametrize("calls", [1, 2, 5])
+@pytest.mark.parametrize(
+    ("changes", "calls"),
+    [
+        ({"stages": 2, "steps": 40}, 2),
+        (NOISY, 2),
+        *(pytest.param(NOISY, calls, marks=pytest.mark.long) for calls in (1, 5)),
+    ],
+)
 def test_an_interrupted_fit_goes_on_to_the_same_bits(tmp_path, changes, calls, capsys):
     expected = arrays_of(fitted(tmp_path, asked(**changes)))
     folder = tmp_path / "interrupted"
@@ -231,7 +237,7 @@ def breaking(x, item, softness):
     return cost(x, item, softness) + 0 * jnp.sqrt(small)
 
 
-@pytest.mark.parametrize("kind", ["smooth", "noisy"])
+@pytest.mark.parametrize("kind", ["smooth", pytest.param("noisy", marks=pytest.mark.long)])
 def test_a_gradient_that_is_not_finite_is_told(tmp_path, kind, capsys):
     """The step, the parameter, the drive and the frame; and the best so far stays."""
     assert SPACE.start[LAST] > 0.5 > 0.2 > TARGETS[:, LAST].mean()

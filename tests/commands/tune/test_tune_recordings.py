@@ -82,7 +82,9 @@ def long_enough(recording: Recording, begin: int, end: int, shortest: int) -> se
     return kept
 
 
-@pytest.mark.parametrize("part", [*HALVES, (0.25, 0.7)])
+@pytest.mark.parametrize(
+    "part", [(0.25, 0.7), *(pytest.param(half, marks=pytest.mark.long) for half in HALVES)]
+)
 def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
     recorded = jax.device_get(sequences_of_recording(test_7, part))
     place_of = places(test_7)
