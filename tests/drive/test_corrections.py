@@ -2,7 +2,6 @@
 to the servo; a vehicle without calibration changes no bit."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from jaxnav.drive.pilot import Input
 from jaxnav.errors import BadInput
 from jaxnav.files import load_vehicle, save_vehicle
 from jaxnav.files.provenance import calibrated_now
-from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS
 from jaxnav.vehicles.sim import SimVehicle
 from jaxnav.vehicles.world import SimWorld
@@ -34,7 +32,6 @@ CORRECTIONS = {
     "steering_offset_rad": 0.02,
     "camera_delay_s": 0.035,
 }
-HERE = Path("drive.mcap")
 
 
 def vehicle(**changes: float):
@@ -169,12 +166,3 @@ def test_impossible_figures_are_named(tmp_path, key, value):
     save_vehicle(path, dataclasses.replace(worlds.qcar(), **{key: value}))
     with pytest.raises(BadInput, match=f"{key}: must be"):
         load_vehicle(path)
-
-
-def test_a_recorded_drive_keeps_the_calibration_and_an_old_one_has_none():
-    setup = make_setup()
-    assert "speed_scale" not in setup.header()["vehicle"]
-    header = dataclasses.replace(setup, vehicle=vehicle()).header()
-    assert header["vehicle"]["camera_delay_s"] == 0.035
-    read = DriveSetup.from_header(header, HERE).vehicle
-    assert Corrections.of(read) == Corrections.of(vehicle())

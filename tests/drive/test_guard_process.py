@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -25,12 +25,17 @@ REPLACED_S = 2.0
 SLACK_S = 0.3  # of a machine that does something else; measured without it by bench_stop.py
 
 
-@contextmanager
-def closing_of(guarding):
-    try:
-        yield guarding
-    finally:
-        guarding.end()
+@pytest.fixture
+def guarding_of():
+    """Processes of guards that are ended in the end."""
+    with ExitStack() as closing:
+
+        def made(name):
+            guarding = GuardProcess(name)
+            closing.callback(guarding.end)
+            return guarding
+
+        yield made
 
 
 class Drive:
@@ -213,9 +218,9 @@ def test_told_to_end_it_stops_the_vehicle_and_says_so(drive):
     wait_for(lambda: words(drive.log)[-1].throttle == 0)
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"])
-def test_what_a_terminal_sends_is_not_for_it(drive, number):
-    os.kill(drive.vehicle.pid, getattr(signal, number))
+def test_what_a_terminal_sends_is_not_for_it(drive):
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
+        os.kill(drive.vehicle.pid, number)
     drive.drive(0.3)
     assert not drive.guard.tripped
 
@@ -235,13 +240,16 @@ def test_a_bus_that_is_out_for_long_hears_the_stop_when_it_is_back(tmp_path):
     assert (drive.vehicle.unheard, drive.vehicle.replaced) == (None, None)
 
 
-def hang(drive, how):
-    """Let the car hang in its next word; returns when the guard's process is silent."""
+def hung(folder, how="stopped", timeout_s=0.6, **options):
+    """A drive whose car hangs in its last word, and with it the guard's process."""
+    drive = Drive(folder, timeout_s=timeout_s, hangs=folder / "hangs", **options)
+    drive.drive()
     (drive.log.parent / "hangs").write_text(how)
     drive.drive(0.15)  # the last ones are not obeyed any more
     assert drive.driven()
     assert words(drive.log)[-1].throttle
     (drive.log.parent / "hangs").unlink()
+    return drive
 
 
 ENDINGS = {
@@ -254,9 +262,7 @@ ENDINGS = {
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("how", plain_car.HANGS)
 def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, ending):
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, how)
+    drive = hung(tmp_path, how)
     pid, due_ns = drive.vehicle.pid, time.monotonic_ns()
     ENDINGS[ending](drive)
     wait_for(lambda: words(drive.log)[-1].throttle == 0)
@@ -272,9 +278,7 @@ def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, endin
 
 
 def test_nobody_needs_to_ask_for_a_reading_for_a_hang_to_be_noticed(tmp_path):
-    drive = Drive(tmp_path, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, "stopped")  # the loop asks no more: its own guard stops the vehicle
+    drive = hung(tmp_path, timeout_s=0.2)  # the loop asks no more: its own guard stops the vehicle
     assert drive.guard.wait(2.0)
     wait_for(lambda: words(drive.log)[-1].throttle == 0)
     assert words(drive.log)[-1].pid != drive.vehicle.pid
@@ -282,9 +286,7 @@ def test_nobody_needs_to_ask_for_a_reading_for_a_hang_to_be_noticed(tmp_path):
 
 
 def test_where_nothing_can_be_opened_or_started_any_more_it_is_replaced_too(tmp_path):
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, "stopped")
+    drive = hung(tmp_path)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
     try:
@@ -297,9 +299,7 @@ def test_where_nothing_can_be_opened_or_started_any_more_it_is_replaced_too(tmp_
 
 
 def test_where_the_spare_hangs_as_well_another_one_is_started(tmp_path):
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, "stopped")
+    drive = hung(tmp_path)
     os.kill(drive.guarding.spare_pid, signal.SIGSTOP)
     drive.guard.close()
     assert words(drive.log)[-1].throttle == 0
@@ -310,9 +310,7 @@ def test_where_the_spare_hangs_as_well_another_one_is_started(tmp_path):
 def test_what_no_process_could_stop_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(moved_vehicle, "_CLOSES_S", 1.0)
     deaf = tmp_path / "deaf"
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs", deaf=deaf)
-    drive.drive()
-    hang(drive, "stopped")
+    drive = hung(tmp_path, deaf=deaf)
     deaf.touch()
     drive.guard.close(heard_within_s=1.0)
     assert drive.vehicle.replaced is None
@@ -362,33 +360,32 @@ def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):
         ("tests.helpers.plain_car:nothing", "there --car: tests.helpers.plain_car:nothing: "),
     ],
 )
-def test_a_vehicle_that_can_not_be_moved_says_why(tmp_path, name, why):
-    with closing_of(GuardProcess(name)) as guarding:
-        guarding.prepare(lambda: None)
-        assert guarding.open(make_setup(log=tmp_path / "log"), LIMITS, 0.2) is None
-        assert guarding.stays.startswith(why)
-        assert guarding.process.wait(5) == 0
+def test_a_vehicle_that_can_not_be_moved_says_why(tmp_path, guarding_of, name, why):
+    guarding = guarding_of(name)
+    guarding.prepare(lambda: None)
+    assert guarding.open(make_setup(log=tmp_path / "log"), LIMITS, 0.2) is None
+    assert guarding.stays.startswith(why)
+    assert guarding.process.wait(5) == 0
 
 
-def test_a_vehicle_that_does_not_open_is_bad_input(tmp_path):
-    with closing_of(GuardProcess(plain_car.NAME)) as guarding:
-        guarding.prepare(lambda: None)
-        with pytest.raises(BadInput, match="could not be opened: "):
-            guarding.open(make_setup(log=tmp_path / "nowhere" / "log"), LIMITS, 0.2)
+def test_a_vehicle_that_does_not_open_is_bad_input(tmp_path, guarding_of):
+    guarding = guarding_of(plain_car.NAME)
+    guarding.prepare(lambda: None)
+    with pytest.raises(BadInput, match="could not be opened: "):
+        guarding.open(make_setup(log=tmp_path / "nowhere" / "log"), LIMITS, 0.2)
 
 
-def test_a_wait_for_it_can_be_called_off():
+def test_a_wait_for_it_can_be_called_off(guarding_of):
     def called_off():
         raise KeyboardInterrupt
 
-    with closing_of(GuardProcess(plain_car.NAME)) as guarding, pytest.raises(KeyboardInterrupt):
-        guarding.prepare(called_off)
+    with pytest.raises(KeyboardInterrupt):
+        guarding_of(plain_car.NAME).prepare(called_off)
 
 
-@pytest.mark.parametrize("module", ["qcar", "ros2"])
-def test_plug_ins_of_hardware_need_neither_jax_nor_opencv(module):
+def test_plug_ins_of_hardware_need_neither_jax_nor_opencv():
     source = (
-        f"import sys, jaxnav.vehicles.{module}, jaxnav.drive.guard_process\n"
+        "import sys, jaxnav.vehicles.qcar, jaxnav.vehicles.ros2, jaxnav.drive.guard_process\n"
         "print([name for name in ('jax', 'cv2', 'jaxlib') if name in sys.modules])"
     )
     told = subprocess.run(

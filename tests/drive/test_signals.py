@@ -13,7 +13,7 @@ import pytest
 from jaxnav.drive.signals import Interrupted, Signals
 
 ROOT = Path(__file__).resolve().parents[2]
-ALL = ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1", "SIGALRM"]
+ALL = ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1"]
 
 
 def raise_signal(name):
@@ -142,7 +142,7 @@ def test_a_start_that_compiles_for_long_ends_soon():
 
 
 def test_once_something_is_open_it_is_not_cut_short():
-    code, took_s, err = ended("signals.hold()", 3, "SIGINT")
+    code, took_s, err = ended("signals.hold()", 2, "SIGINT")
     assert code == 1  # its own end: nobody caught `Interrupted` here
-    assert took_s > 2
+    assert took_s > 1
     assert "Interrupted: SIGINT" in err

@@ -45,7 +45,7 @@ class Drive:
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 0.3, 1.5])
-@pytest.mark.parametrize("scale", [0.93, 1.0, 1.07])
+@pytest.mark.parametrize("scale", [0.93, 1.07])
 def test_wheels_within_their_calibration_dispute_nothing(speed_mps, scale):
     assert not any(Drive(speed_mps, scale).seconds(30))
 
@@ -211,18 +211,13 @@ def test_cameras_that_see_a_marker_in_turns_tell_it_together(scale):
     assert named_m[-1] is not None
 
 
-def test_it_lasts_while_nothing_is_seen_as_well():
-    ranges = Ranges()
-    looks(ranges, scale=2.0, way_m=0.5)
-    assert not ranges.lasting
-    ranges.add_way(0.5)
-    assert ranges.lasting
-
-
-def test_it_is_forgotten_once_the_files_agree():
+def test_it_lasts_while_nothing_is_seen_and_is_forgotten_once_the_files_agree():
     ranges = Ranges()
     looks(ranges, scale=2.0, way_m=0.5)
     assert ranges.contradicted
+    assert not ranges.lasting
+    ranges.add_way(0.5)
+    assert ranges.lasting
     looks(ranges, lane=(1, 0))
     assert not ranges.contradicted
 
@@ -249,11 +244,6 @@ def test_all_within_a_distance_of_a_leg_is_inside(place_m, is_left):
     corridor = Corridor(SQUARE, 1.0)
     assert not corridor.is_left(np.zeros(2))  # where it begins
     assert corridor.is_left(np.array(place_m)) == is_left
-
-
-def test_a_route_of_one_place_where_it_stands_is_a_circle():
-    corridor, places_m = Corridor([(0.0, 0.0)], 1.0), np.array([(0, 0), (0.9, 0), (0, 1.1)])
-    assert [corridor.is_left(place_m) for place_m in places_m] == [False, False, True]
 
 
 def test_by_default_it_is_one_and_a_half_legs_and_a_metre(tmp_path):

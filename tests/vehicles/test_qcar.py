@@ -49,15 +49,12 @@ def test_its_cameras_keep_theirs(hardware):
     assert all(camera.terminated for camera in hardware.cameras.csi)
 
 
-def test_it_reads_the_tachometer(hardware, car):
-    hardware.tach_mps = -0.75
-    reading = car.read()
-    assert reading.speed_mps == -0.75
-    assert reading.valid
-
-
 def test_a_reading_that_repeats_is_not_valid_until_it_changes(hardware, car):
-    assert car.read().valid
+    hardware.tach_mps = -0.75
+    for _ in range(30):  # one sensor alone may repeat: a car that stands has the same speed
+        reading = car.read()
+        assert (reading.speed_mps, reading.valid) == (-0.75, True)
+        time.sleep(0.003)
     hardware.fails = True
     stale = [car.read()]
     while stale[-1].valid and len(stale) < 1000:
@@ -66,13 +63,6 @@ def test_a_reading_that_repeats_is_not_valid_until_it_changes(hardware, car):
     assert 5 <= len(stale) < 100
     hardware.fails = False
     assert car.read().valid
-
-
-def test_one_sensor_alone_may_repeat(hardware, car):
-    """A car that stands has the same encoder and the same speed all the time."""
-    for _ in range(30):
-        assert car.read().valid
-        time.sleep(0.003)
 
 
 def test_it_reports_the_steering_that_the_servo_has_reached(hardware, car):
@@ -232,12 +222,9 @@ def cameras(setup):
     ("opens", "option", "value", "problem"),
     [
         (open_vehicle, "frequency", "fast", "expected a number from 100 to 1000, got 'fast'"),
-        (open_vehicle, "frequency", "nan", "expected a number from 100 to 1000"),
-        (open_vehicle, "frequency", "20", "expected a number from 100 to 1000"),
         (open_vehicle, "frequency", "150.5", "expected a whole number, got '150.5'"),
         (open_vehicle, "read_mode", "2", "expected a number from 0 to 1"),
         (cameras, "frame_rate", "0", "expected a number"),
-        (cameras, "latency_ms", "-1", "expected a number"),
         (cameras, "latency_ms", "inf", "expected a number"),
     ],
 )

@@ -113,11 +113,8 @@ def backwards(count=itertools.count()):  # noqa: B008
     ("vehicle", "sentence"),
     [
         (broken(stop=None), r"the vehicle has no stop\(\)"),
-        (broken(timeout_s=0.0), "timeout_s must be positive, or inf, not 0.0"),
         (broken(timeout_s="soon"), "timeout_s is no number but 'soon'"),
-        (reads(speed_mps=np.nan), "speed_mps of a valid Odometry must be a finite number, not nan"),
         (reads(time.monotonic), "stamp_ns of an Odometry must be an int"),
-        (reads(time.time_ns), "stamp_ns of an Odometry lies .* s in the future"),
         (
             reads(lambda: time.monotonic_ns() - 3_000_000_000),
             "stamp_ns of an Odometry is 3.* s old: it must be of time.monotonic_ns",
@@ -131,7 +128,6 @@ def backwards(count=itertools.count()):  # noqa: B008
             broken(read=lambda self: time.sleep(0.06) or GoodVehicle.read(self)),
             r"read\(\) took longer than 0.05 s",
         ),
-        (broken(read=lambda self: None), r"read\(\) gives None, expected an Odometry"),
         (broken(read=no_cable), r"read\(\) raised OSError for 0.5 s: no cable"),
         (reads(valid=False), r"no reading of read\(\) was valid"),
         (RaisesValueError, r"write\(0.*\) raised ValueError: too fast; only OSError is allowed"),
@@ -216,24 +212,15 @@ def in_one_buffer(self):
             lambda s, v: good_cameras(s, v)[::-1],
             "the cameras are right, front, those of the rig front, right",
         ),
-        (lambda s, v: good_cameras(s, v)[:1], "the cameras are front, those of the rig"),
         (
             broken_camera(stamp_ns=lambda self: 7),
             "stamp_ns of a frame of the camera front is .* s old",
-        ),
-        (
-            broken_camera(stamp_ns=lambda self: time.monotonic_ns() + 10**8),
-            "stamp_ns of a frame of the camera front lies .* s in the future",
         ),
         (
             broken_camera(
                 stamp_ns=lambda self: self.__dict__.setdefault("first", time.monotonic_ns())
             ),
             "the camera front gives the same or an older stamp again",
-        ),
-        (
-            broken_camera(image=lambda self: GoodCamera.image(self).astype(float)),
-            "the image of a frame of the camera front is float64, expected uint8",
         ),
         (
             broken_camera(image=lambda self: GoodCamera.image(self).T),
@@ -248,10 +235,6 @@ def in_one_buffer(self):
         (
             broken_camera(read=lambda self, timeout_s: self.closed.wait(0.4) or None),
             r"read\(0\) of the camera front took 0.4",
-        ),
-        (
-            broken_camera(read=lambda self, timeout_s: self.closed.wait(timeout_s) or None),
-            "the camera front gave 0 frames in 0.5 s, expected 5",
         ),
         (
             broken_camera(read=lambda self, timeout_s: 1 / 0),
@@ -273,18 +256,18 @@ def test_a_broken_promise_of_a_camera_is_named(factory, sentence, monkeypatch):
         check_cameras(factory, SHORT_RIG)
 
 
-@pytest.mark.parametrize("shape", [(2, 4, 2), (2, 8)])
-def test_a_camera_may_detect_by_itself(shape):
-    found = Detections(
-        np.arange(2), np.zeros(shape), np.ones((2, 4)), np.ones(2, bool), ("tag36h11",) * 2
-    )
+def test_a_camera_may_detect_by_itself():
+    def factory(shape):
+        found = Detections(
+            np.arange(2), np.zeros(shape), np.ones((2, 4)), np.ones(2, bool), ("tag36h11",) * 2
+        )
 
-    def read(self, timeout_s):
-        frame = GoodCamera.read(self, timeout_s)
-        return frame and Frame(frame.stamp_ns, detections=found)
+        def read(self, timeout_s):
+            frame = GoodCamera.read(self, timeout_s)
+            return frame and Frame(frame.stamp_ns, detections=found)
 
-    if shape == (2, 4, 2):
-        check_cameras(broken_camera(read=read), SHORT_RIG)
-        return
+        return broken_camera(read=read)
+
+    check_cameras(factory((2, 4, 2)), SHORT_RIG)
     with pytest.raises(AssertionError, match=r"the corners of .* have the shape \(2, 8\)"):
-        check_cameras(broken_camera(read=read), SHORT_RIG)
+        check_cameras(factory((2, 8)), SHORT_RIG)
