@@ -4,7 +4,6 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ def assert_same_place(a: CameraEntry, b: CameraEntry) -> None:
 def test_a_camera_comes_back_bit_for_bit(to, lens):
     suffix = ".json" if to == "photonvision" else ".yaml"
 
-    @settings(drawn, max_examples=30)
+    @settings(drawn, max_examples=15)
     @given(a_camera(lens))
     def check(camera: CameraEntry) -> None:
         with tempfile.TemporaryDirectory() as name:
@@ -70,7 +69,7 @@ def test_a_camera_comes_back_bit_for_bit(to, lens):
     check()
 
 
-@settings(drawn, max_examples=40)
+@settings(drawn, max_examples=20)
 @given(st.data())
 def test_a_rig_goes_through_a_camchain_bit_for_bit(data):
     lenses = [lens for lens in LENS_COEFFICIENTS if lens not in ("rational", "thin_prism")]
@@ -94,7 +93,7 @@ def test_a_rig_goes_through_a_camchain_bit_for_bit(data):
             np.testing.assert_allclose(chained, T, rtol=0, atol=rounding)
 
 
-@settings(drawn, max_examples=40)
+@settings(drawn, max_examples=20)
 @given(st.data())
 def test_a_map_goes_through_a_field_layout(data):
     size_m = data.draw(st.floats(1e-3, 10))
@@ -156,8 +155,8 @@ def tried(source: Path, to: str, out: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_whatever_is_changed_is_carried_over_or_one_line(name, capsys):
-    whole = read_mapping_of(name, SEEDS[name])
+def test_whatever_is_changed_is_carried_over_or_one_line(name, tmp_path, capsys):
+    whole = read_mapping(written(tmp_path, name, SEEDS[name]))
 
     @settings(drawn, max_examples=2 * EXAMPLES)
     @given(restructured(whole))
@@ -172,8 +171,3 @@ def test_whatever_is_changed_is_carried_over_or_one_line(name, capsys):
         capsys.readouterr()
 
     check()
-
-
-def read_mapping_of(name: str, text: str) -> dict[str, Any]:
-    with tempfile.TemporaryDirectory() as folder:
-        return read_mapping(written(Path(folder), name, text))

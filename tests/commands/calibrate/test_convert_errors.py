@@ -39,11 +39,9 @@ def camera(lens: str, distortion: list[float] | None = None, name: str = "front"
 REFUSED = [
     (camera("radtan", [0.1, 0, 0, 0, 0.2]), "kalibr", "front.distortion: has k3, and Kalibr's"),
     (camera("rational"), "kalibr", "front.lens: is rational, and Kalibr has radtan, equidistant, "),
-    (camera("thin_prism"), "kalibr", "front.lens: is thin_prism, and Kalibr has radtan, equid"),
     (camera("omni"), "ros", "--to ros: front.lens: is omni, and ROS's camera_info knows radtan"),
     (camera("double_sphere"), "opencv", "front.lens: is double_sphere, and OpenCV knows radtan"),
     (camera("eucm"), "photonvision", "front.lens: is eucm, and PhotonVision knows radtan alone"),
-    (camera("equidistant"), "photonvision", "front.lens: is equidistant, and PhotonVision knows"),
     (camera("none"), "jaxnav", "is jaxnav's already: nothing to convert"),
     (camera("none"), "wpilib", "holds cameras, and a WPILib layout holds markers"),
     (camera("none", name="/a/image_raw"), "kalibr", "has a name that stands for a topic"),
@@ -60,28 +58,20 @@ def test_what_a_format_cannot_hold_is_one_line(tmp_path, held, to, expected):
 MARKER = {"id": 1, "family": "tag36h11", "size_m": 0.2, "T_world_marker": np.eye(4).tolist()}
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        (
-            {"id": 2, "size_m": 0.3},
-            "--to wpilib: size_m: a layout has tags of one size, these have",
-        ),
-        ({"family": "tag16h5"}, "tags of one AprilTag family (tag16h5, tag25h9, tag36h11), these"),
-    ],
-)
-def test_a_layout_has_one_size_and_one_family(tmp_path, change, expected):
-    entries = [MARKER, MARKER | change]
-    source = written(tmp_path, "map.yaml", json.dumps({"markers": entries}))
-    assert expected in problem(source, "wpilib", tmp_path / "layout.json")
-    source = written(tmp_path, "map.yaml", json.dumps({"markers": [MARKER | {"family": "4x4_50"}]}))
-    assert "these are 4x4_50" in problem(source, "wpilib", tmp_path / "layout.json")
+def test_a_layout_has_one_size_and_one_family(tmp_path):
+    of_one_family = "tags of one AprilTag family (tag16h5, tag25h9, tag36h11), these"
+    for entries, expected in (
+        ([MARKER, MARKER | {"id": 2, "size_m": 0.3}], "size_m: a layout has tags of one size"),
+        ([MARKER, MARKER | {"family": "tag16h5"}], of_one_family),
+        ([MARKER | {"family": "4x4_50"}], "these are 4x4_50"),
+    ):
+        source = written(tmp_path, "map.yaml", json.dumps({"markers": entries}))
+        assert expected in problem(source, "wpilib", tmp_path / "layout.json")
     assert "holds markers, and ros does not" in problem(source, "ros", tmp_path / "out.yaml")
 
 
 FLAGS = [
     (QCAR / "rig.yaml", "ros", "o", {"marker_size_m": 0.1}, "--marker-size-m: goes with a WPILib"),
-    (QCAR / "rig.yaml", "ros", "o", {"family": "tag16h5"}, "--family: goes with a WPILib layout"),
     (QCAR / "rig.yaml", "ros", "o", {"field_size_m": (1.0, 1.0)}, "--field-size-m: goes with --to"),
     (QCAR / "markers.yaml", "wpilib", "o.json", {"camera_name": "a"}, "--camera-name: goes with"),
     (QCAR / "rig.yaml", "ros", "o", {"position_m": (0.0, 0.0, 0.0)}, "goes with --to jaxnav or k"),
@@ -100,21 +90,13 @@ def test_a_flag_that_does_not_fit_is_one_line(tmp_path, source, to, out, flags, 
     assert expected in problem(source, to, tmp_path / out, **flags)
 
 
-@pytest.mark.parametrize(
-    ("flags", "expected"),
-    [
+def test_a_value_that_cannot_be_is_one_line():
+    for flags, expected in (
         ({"yaw_deg": 3.0}, "--yaw-deg: needs --position-m"),
-        (
-            {"position_m": (0.0, 0.0, 0.0), "roll_deg": float("nan")},
-            "--roll-deg: must be from -3600 to 3600 deg, got",
-        ),
         ({"field_size_m": (1.0, 0.0)}, "--field-size-m: must be greater than 0, got 0.0"),
-        ({"marker_size_m": -1.0}, "--marker-size-m: must be from 0.001 to 100 m, got -1"),
-    ],
-)
-def test_a_value_that_cannot_be_is_one_line(flags, expected):
-    with pytest.raises(BadInput, match=expected.replace("(", "\\(")):
-        check_values(CalibrateConvert(Path("a"), "ros", Path("b"), **flags))
+    ):
+        with pytest.raises(BadInput, match=expected):
+            check_values(CalibrateConvert(Path("a"), "ros", Path("b"), **flags))
 
 
 def test_a_camera_without_a_place_goes_into_no_rig(tmp_path):
@@ -180,11 +162,3 @@ def test_what_was_calibrated_is_told_to_be_left_behind(tmp_path, capsys):
     source = written(tmp_path, "rig.yaml", json.dumps(rig))
     convert(source, "kalibr", tmp_path / "chain.yaml")
     assert "not carried over: calibrated, cameras.front.sigma\n" in capsys.readouterr().out
-
-
-def test_the_source_is_not_written_over(tmp_path):
-    source = written(tmp_path, "rig.yaml", rig_text([camera("none")]))
-    line = problem(source, "kalibr", tmp_path / "." / "rig.yaml")
-    assert line.startswith("--out: ")
-    assert line.endswith("would be written over: choose another name")
-    assert source.read_text() == rig_text([camera("none")])

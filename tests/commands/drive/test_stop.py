@@ -96,8 +96,6 @@ def test_a_driver_that_hangs_is_not_waited_for(tmp_path):
         ("--car sim", "--car: sim ends with its drive: nothing is left to stop"),
         ("--car tests.helpers.plain_car:open_curious_vehicle --option log=x",
          "--car tests.helpers.plain_car:open_curious_vehicle: can't be opened by itself: it looks"),
-        ("--car tests.helpers.plain_car:open_vehicle --option log", "--option: expected KEY=VALUE"),
-        ("--car tests.helpers.plain_car:open_vehicle --vehicle no.yaml", "no.yaml: can't be read"),
         ("--car tests.helpers.plain_car:open_vehicle --vehicle bad.yaml",
          "bad.yaml: steering_limit_rad: missing"),
         ("--car tests.helpers.plain_car:open_vehicle --vehicle odd.yaml",
