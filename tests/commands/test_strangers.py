@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -109,25 +110,32 @@ def test_it_arrives_where_it_thinks(stranger, driven):
     assert shown == {f"/camera/{name}" for name in stranger.cameras}
 
 
+@pytest.fixture
+def as_driven(monkeypatch) -> Iterator[None]:
+    """In the drive's precision, with what it has compiled."""
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
+    with jax.enable_x64(False):
+        yield
+
+
 def test_its_drive_replays_to_the_same_bits_and_its_images_are_searched_once_more(
-    stranger, driven, tmp_path
+    driven, as_driven, here, tmp_path
 ):
     for more in ((), ("--images", "--limit", 60)):
-        ended = jaxnav(
-            stranger.folder, "replay", driven.path, *more, "--out", tmp_path, "--headless"
-        )
-        assert (ended.returncode, ended.stderr) == (0, "")
+        code, _, err = here("replay", driven.path, *more, "--out", tmp_path, "--headless")
+        assert (code, err) == (0, "")
         summary = json.loads((tmp_path / "summary.json").read_text())
         assert more or (summary["bit_for_bit"] and summary["compared"] > 50)
     assert summary["decided_share"] > 0.2
 
 
-def test_its_drive_is_driven_again(stranger, driven):
-    ended = jaxnav(
-        stranger.folder, "run", "--car", "replay", "--option", f"drive={driven.path}",
-        "--timeout-s", 3, "--detector", "decode-only", "--headless",
+def test_its_drive_is_driven_again(driven, as_driven, here):
+    code, out, err = here(
+        "run", "--car", "replay", "--option", f"drive={driven.path}", "--timeout-s", 3,
+        "--detector", "decode-only", "--headless",
     )  # fmt: skip
-    assert (ended.returncode, ended.stderr) == (0, "")
+    assert (code, err) == (0, "")
+    assert out.startswith("ended: the recording is over\n")
 
 
 def test_its_drive_is_drawn(driven, here, tmp_path):

@@ -23,7 +23,7 @@ from jaxnav.detection import Detections
 from jaxnav.drive.camera_delays import HARMLESS_S, KNOWN_S, SURE_SIGMAS, CameraDelays, Delay
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.frames import FrameDetections, FrameIntake
-from jaxnav.drive.history import EventData, Sighting
+from jaxnav.drive.history import EventData
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.sim.corners import see
@@ -181,15 +181,6 @@ def test_what_is_corrected_already_is_not_found_again():
     assert number == pytest.approx(0.12, abs=0.02)
 
 
-def test_far_from_zero_it_is_the_same():
-    far = dataclasses.replace(MARKERS, origin_m=(1e7, -1e7, 0.0))
-    setup = dataclasses.replace(SETUP, markers=far)
-    log = Drive(0.05).log(setup)
-    log.outcomes.pose[:, :2] += [1e7, -1e7]
-    moved, here = delays_of(log, setup).delays[0], found_on(Drive(0.05)).delays[0]
-    assert moved.delay_s == pytest.approx(here.delay_s, abs=1e-4)
-
-
 def test_a_delay_is_late_only_where_it_is_sure():
     sure = HARMLESS_S + SURE_SIGMAS * 0.005
     assert Delay(sure + 1e-3, 0.005).late
@@ -207,18 +198,6 @@ def test_stretches_that_contradict_each_other_widen_sigma():
         delays._counts[0] += 1
     assert delays.delays[0].delay_s == pytest.approx(0.05)
     assert not delays.delays[0].known
-
-
-def test_nothing_grows_however_long_it_drives():
-    delays = CameraDelays(RIG, MARKERS, VEHICLE)
-    corners_px, visible = np.zeros((4, 1, 4, 2)), np.ones((4, 1), bool)
-    told = Sighting(corners_px=corners_px, visible=visible, sigma_px=np.ones((4, 1, 4)))
-    for count in range(9000):
-        delays.add_reading(count * 10**7, 0.1, 0.0)
-        delays.add_corners(count * 10**7, told)
-        delays.add_pose(count * 10**7, np.zeros(3))
-    kept = delays._readings, delays._views, delays._open
-    assert [len(one) for one in kept] == [one.maxlen for one in kept]
 
 
 def outcome_of(given: Input, pose: np.ndarray, frames: FrameIntake):

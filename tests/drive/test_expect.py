@@ -126,14 +126,6 @@ def test_any_covariance_gives_an_answer():
     assert not unknown.visible.any()
 
 
-def test_it_is_compiled_once():
-    before = expect_corners.jitted._cache_size()
-    for mean in MEANS:
-        for belief in BELIEFS.values():
-            expect(mean, covariance_of(*belief), 2.0)
-    assert expect_corners.jitted._cache_size() - before <= 1
-
-
 NAVIGATOR = SimpleNamespace(rig=RIG, markers=MARKERS, corner_sigma_px=np.array(1.0))
 POSES = np.array([[0.1, 0.2, 1.5], [-0.4, -0.3, 0.2], [0.7, 0.1, -2.0], [0, 0, 0]])
 WEIGHTS = np.array([0.2, 0.5, 0.3, 0.0])  # of the last nothing is known

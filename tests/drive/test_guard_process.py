@@ -1,5 +1,6 @@
 """The guard's process: whatever happens to the computing process, the vehicle stops, and soon."""
 
+import itertools
 import os
 import resource
 import signal
@@ -79,7 +80,12 @@ def drive(tmp_path):
     drive.guard.close()
 
 
-@pytest.mark.parametrize("how", ENDS)
+OFTEN = {"kill -9", "SIGSTOP", "no memory", "held lock"}
+
+
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=() if how in OFTEN else pytest.mark.long) for how in ENDS]
+)
 def test_however_the_process_that_computes_ends_the_vehicle_stands(tmp_path, how):
     log = tmp_path / "log"
     process = subprocess.Popen(
@@ -259,8 +265,17 @@ ENDINGS = {
 }
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("how", plain_car.HANGS)
+# Each hang and each ending once; in `make test-all` all together.
+TOGETHER = list(zip(plain_car.HANGS, ENDINGS, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("how", "ending"),
+    [
+        pytest.param(*both, marks=() if both in TOGETHER else pytest.mark.long)
+        for both in itertools.product(plain_car.HANGS, ENDINGS)
+    ],
+)
 def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, ending):
     drive = hung(tmp_path, how)
     pid, due_ns = drive.vehicle.pid, time.monotonic_ns()
@@ -356,7 +371,7 @@ def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):
     [
         ("jaxnav.vehicles.sim:open_vehicle", "it shares its process"),
         ("tests.helpers.plain_car:open_curious_vehicle", "it looks at setup.rig"),
-        ("tests.worlds:qcar", "its module imports jax"),
+        pytest.param("tests.worlds:qcar", "its module imports jax", marks=pytest.mark.long),
         ("tests.helpers.plain_car:nothing", "there --car: tests.helpers.plain_car:nothing: "),
     ],
 )

@@ -97,17 +97,6 @@ def test_a_stamp_that_can_not_be_is_refused(off_ms):
     assert mean(track, 0, 20) == pytest.approx(1.5)
 
 
-def test_the_clock_of_a_gyro_may_jump():
-    track = GyroTrack(LIMIT_RADPS)
-    told(track, [1.0, 1.5])
-    faults = Fault(0)
-    for index in range(20):
-        now_ns = BEGIN_NS + (20 + 10 * index) * MS
-        faults |= track.take([GyroReading(now_ns - 100_000 * MS, 1.0 + 0.1 * index)], now_ns)
-    assert faults == Fault.STAMP_INVALID | Fault.CLOCK_JUMPED
-    assert mean(track, 190, 210) == pytest.approx(2.8, abs=0.11)
-
-
 @given(
     st.lists(st.tuples(st.integers(-(2**62), 2**62) | st.integers(-(10**9), 10**9), st.floats()))
 )

@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.drive.chassis import chassis_of
 from jaxnav.drive.flags import Fault
-from jaxnav.drive.odometer import Odometer, Odometers
-from tests import worlds
+from jaxnav.drive.odometer import Odometer
 
 MAX_MPS, PER_THROTTLE, LAG_S = 3.0, 10.0, 0.3
 PERIOD_NS = 20_000_000
@@ -141,12 +139,3 @@ def test_whatever_is_told_no_impossible_speed_is_believed(readings):
         if taken:
             assert abs(speed_mps) <= 1.5 * MAX_MPS + 0.05
             assert odometer.last_mps == speed_mps
-
-
-def test_the_limits_are_the_vehicles():
-    vehicle = worlds.qcar()
-    (odometer,) = Odometers(chassis_of(vehicle)).parts
-    assert odometer.max_mps == pytest.approx(
-        float(vehicle.throttle_limit) * float(vehicle.speed_per_throttle_mps)
-    )
-    assert odometer.time_constant_s == float(vehicle.speed_time_constant_s)

@@ -176,11 +176,6 @@ def test_devices_keep_the_promises_of_cameras(device):
     assert right.released
 
 
-def test_a_name_that_udev_gave_leads_to_its_device(monkeypatch):
-    monkeypatch.setattr(opencv_cameras.Path, "resolve", lambda path: "/dev/video5")
-    assert opencv_cameras._device("/dev/v4l/by-id/usb-camera") == 5
-
-
 def test_gstreamer_gets_the_pipeline(device, monkeypatch):
     monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GStreamer:        YES (1.20.3)\n")
     for camera in from_sources(PIPELINE):

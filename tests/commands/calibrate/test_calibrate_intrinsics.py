@@ -154,9 +154,10 @@ def few(shots, folder):
             r"3 different, .* are too few: .*: 3.png \(the same picture as 0.png\), and 8 more",
         ),
         (two_sizes, r"1.png: is 320 x 240 pixels, but .*0.png is 820 x 410: calibrate one camera"),
-        (
+        pytest.param(
             parallel,
             r"shots: the board is parallel to itself in all views, .*: tilt the board by 30 to 45",
+            marks=pytest.mark.long,
         ),
         (few, r"front/0.png and 2 more: 3 different, sharp views .* take at least 5"),
     ],

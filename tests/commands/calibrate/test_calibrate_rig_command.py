@@ -107,6 +107,7 @@ def test_coverage_counts_cells():
     assert coverage(np.zeros((0, 4, 2)), (100, 50)) == 0
 
 
+@pytest.mark.long
 def test_one_camera_may_hold_the_frame(drive, tmp_path, capsys):
     words = ("--vehicle-frame", "left", "--out", tmp_path)
     code, _, err = told(capsys, "rig", drive / "drive.mcap", *words)

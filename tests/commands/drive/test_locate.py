@@ -174,7 +174,11 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, args, message):
     ("changed", "note"),
     [
         (("--marker-size-m", "86"), "86 is 86 m: 0.086 if 86 are mm, 0.86 if they are cm"),
-        (("--family", "4x4_50"), "1 of tag36h11 in view (id 0): --family tag36h11"),
+        pytest.param(
+            ("--family", "4x4_50"),
+            "1 of tag36h11 in view (id 0): --family tag36h11",
+            marks=pytest.mark.long,
+        ),
         ((), "rig.yaml has no sigmas of its lens"),
     ],
 )

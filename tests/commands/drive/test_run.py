@@ -226,9 +226,8 @@ def test_a_simulated_drive_that_was_suspended_goes_on(workplace, tmp_path):
         assert_arrived(drive.ended())
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
     with driving(workplace, tmp_path) as drive:
         signalled_ns = time.monotonic_ns()
@@ -345,6 +344,7 @@ def test_where_too_few_files_may_be_open_nothing_is_begun(workplace, tmp_path):
         assert ended.stderr == f"jaxnav run: ulimit -n: must be 64 or more, got {files}\n"
 
 
+@pytest.mark.long
 def test_a_terminal_that_is_stuck_holds_up_neither_the_drive_nor_its_end(workplace, tmp_path):
     ends = os.pipe()
     os.set_blocking(ends[1], False)

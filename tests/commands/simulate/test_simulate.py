@@ -19,7 +19,6 @@ from jaxnav.sim.rollout import Trace
 from jaxnav.sim.scenarios import on_laps, scenarios
 from jaxnav.sim.scores import Drives
 from jaxnav.sim.statistics import Reliability
-from tests.helpers.strangers import jaxnav
 
 SCENARIO = scenarios()["paper"]
 
@@ -103,12 +102,11 @@ def test_errors_after_twenty_seconds_count_apart():
 
 
 def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path, stranger, capsys):
-    """On its own route, and in a process of its own: it chooses the precision."""
+    """On its own route."""
     file = tmp_path / "s.json"
     words = ["--seeds", "3", "--selector", "oracle", *stranger.flags(), "--json", str(file)]
-    ended = jaxnav(stranger.folder, "simulate", *words, "--headless")
-    assert (ended.returncode, ended.stderr) == (0, "")
-    row = ended.stdout.splitlines()[-1]
+    assert main(["simulate", *words, "--headless"]) == 0
+    row = capsys.readouterr().out.splitlines()[-1]
     result = json.loads(file.read_text())
     assert result["run"]["selector"] == "oracle"
     assert result["success_rate"]["value"] == 1

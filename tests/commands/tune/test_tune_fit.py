@@ -16,7 +16,6 @@ from jaxnav.experiments.tuning.fit import Problem, TuningFit, arrays_of
 from jaxnav.experiments.tuning.objective import Batch, Objective, where_not_finite
 from jaxnav.experiments.tuning.unconstrained import Space
 from jaxnav.files import load_params
-from jaxnav.files.writing import sole_writer
 from tests import worlds
 
 NAVIGATOR = with_parameters(
@@ -93,13 +92,6 @@ def test_the_best_is_written(tmp_path, changes, capsys):
     assert (tmp_path / "checkpoint.npz").exists()
     assert capsys.readouterr().out == ""
     with_parameters(NAVIGATOR, {name: jnp.asarray(v) for name, v in written(tmp_path).items()})
-
-
-def test_a_second_process_in_one_folder_is_told(tmp_path):
-    one = fitting(tmp_path, asked())
-    with sole_writer(one.checkpoint), pytest.raises(BadInput, match="by another process"):
-        one.run(headless=True)
-    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_stage_found_in_its_last_step_is_written(tmp_path):
