@@ -111,9 +111,8 @@ def test_it_arrives_where_it_thinks(stranger, driven):
 
 
 @pytest.fixture
-def as_driven(monkeypatch) -> Iterator[None]:
-    """In the drive's precision, with what it has compiled."""
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
+def as_driven() -> Iterator[None]:
+    """In the drive's precision."""
     with jax.enable_x64(False):
         yield
 

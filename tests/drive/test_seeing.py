@@ -35,8 +35,8 @@ BENT = {
 SMALL, USUAL, LARGE = (160, 120), (820, 410), (1280, 720)
 # Programs differ by the number of cells, of codes and the kind of lens, and nothing else: each
 # family and each lens is there.
+NAMES = ("family", "lens", "markers", "cameras", "size_px", "backend", "follow")
 OFTEN = [
-    # family, lens, markers, cameras, size, backend, follow
     ("tag16h5", "radtan", 2, 1, LARGE, "aruco", False),
     ("tag36h11", "omni", 1, 4, USUAL, "apriltag", False),
 ]
@@ -138,10 +138,7 @@ def look_at_all(
 
 
 @pytest.mark.parametrize("precision", ["float32"], indirect=True)
-@pytest.mark.parametrize(
-    ("family", "lens", "markers", "cameras", "size_px", "backend", "follow"),
-    some_often(OFTEN, KINDS),
-)
+@pytest.mark.parametrize(NAMES, some_often(OFTEN, KINDS))
 def test_a_warm_search_calls_no_program_for_the_first_time(
     precision, family, lens, markers, cameras, size_px, backend, follow
 ):
