@@ -315,6 +315,10 @@ def test_a_camera_or_a_vehicle_that_can_not_be_read_now_is_no_reason_to_stop(sta
         raise OSError("unplugged")
 
     with Drive(standing) as drive:
+        # What shows nothing reaches the pilot with the next tick.
+        drive.until(lambda: any(given.frames for given in drive.pilot.handled))
+        assert {s.camera for given in drive.pilot.handled for s in given.frames} == {0}
+        assert all(given.odometry for given in drive.pilot.handled)
         drive.cameras[0].act = drive.car.act = unplugged
         drive.until(lambda: drive.eyes.errors[0] > 0)
         drive.until(
@@ -324,27 +328,19 @@ def test_a_camera_or_a_vehicle_that_can_not_be_read_now_is_no_reason_to_stop(sta
         assert not drive.guard.tripped, drive.guard.reason
 
 
-def test_frames_that_show_nothing_reach_the_pilot_with_the_next_tick(standing):
-    with Drive(standing) as drive:
-        drive.until(lambda: any(given.frames for given in drive.pilot.handled))
-        seen = {s.camera for given in drive.pilot.handled for s in given.frames}
-        assert seen == {0}
-        assert all(given.odometry for given in drive.pilot.handled)
-
-
-def test_it_ends_when_its_time_is_over(standing):
+def test_it_ends_in_good_order_when_its_time_or_what_the_vehicle_drives_is_over(standing):
     with Drive(standing, lasts_s=0.8) as drive:
         drive.thread.join(5)
-        assert drive.ended == "time is over"
+        assert (drive.ended, drive.loop.stopped) == ("time is over", False)
         assert drive.loop.statistics.quantile_ms("handle odometry", 0.5) < 100
-        assert not drive.loop.stopped
-
-
-def test_it_ends_in_good_order_when_the_vehicle_has_nothing_more_to_drive(standing):
     with Drive(standing) as drive:
         drive.car.over = "the tape is over"
         drive.thread.join(1)
         assert (drive.ended, drive.loop.stopped) == ("the tape is over", False)
+    with Drive(standing) as drive:
+        drive.guard.trip("enough")
+        drive.thread.join(1)
+        assert (drive.ended, drive.loop.stopped) == ("enough", True)
 
 
 class Onlooker:
@@ -382,13 +378,6 @@ def test_an_observer_that_raises_ends_nothing_and_is_named_counted_and_a_fault(s
     for what in names:
         assert drive.loop.contained.counts[f"Onlooker.{what}"] > 5
         assert said.count(f"Onlooker.{what}: ValueError: math domain error") == 1
-
-
-def test_a_drive_that_the_guard_ends_was_stopped(standing):
-    with Drive(standing) as drive:
-        drive.guard.trip("enough")
-        drive.thread.join(1)
-        assert (drive.ended, drive.loop.stopped) == ("enough", True)
 
 
 class Backlog:

@@ -70,20 +70,15 @@ def test_it_is_told_while_the_main_thread_is_inside_a_library():
         assert signals.number == signal.SIGTERM
 
 
-def test_one_who_fails_keeps_nobody_else_from_hearing_it():
-    told = []
+def test_one_who_fails_keeps_nobody_else_from_hearing_it_and_handlers_are_given_back():
+    told, before = [], [signal.getsignal(getattr(signal, name)) for name in ALL]
     with Signals() as signals:
+        assert signal.getsignal(signal.SIGINT) not in before
         signals.on_signal(lambda name: 1 / 0)
         signals.on_signal(told.append)
         raise_signal("SIGTERM")
         time.sleep(0.1)
     assert told == ["SIGTERM"]
-
-
-def test_handlers_are_given_back():
-    before = [signal.getsignal(getattr(signal, name)) for name in ALL]
-    with Signals():
-        assert signal.getsignal(signal.SIGINT) not in before
     assert [signal.getsignal(getattr(signal, name)) for name in ALL] == before
     assert signal.set_wakeup_fd(-1) == -1
 

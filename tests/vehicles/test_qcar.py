@@ -39,12 +39,9 @@ def car(hardware):
     vehicle.close()
 
 
-def test_it_keeps_the_promises_of_a_vehicle(hardware):
+def test_vehicle_and_cameras_keep_their_promises(hardware):
     check_vehicle(open_vehicle, SETUP, lambda vehicle: hardware.throttle)
     assert "terminate" in hardware.calls
-
-
-def test_its_cameras_keep_theirs(hardware):
     check_cameras(open_cameras, SETUP)
     assert all(camera.terminated for camera in hardware.cameras.csi)
 
@@ -183,19 +180,15 @@ def test_a_write_that_overtakes_a_stop_and_hangs_is_undone(hardware, car, monkey
     assert hardware.throttle == 0
 
 
-def test_errors_of_the_driver_are_oserrors(hardware, car, monkeypatch):
-    monkeypatch.delattr(type(hardware.car), "read_write_std")
-    with pytest.raises(OSError, match="the QCar's driver: AttributeError"):
-        car.read()
-    monkeypatch.undo()
-
-
-def test_a_closed_car_says_so(hardware, car):
+def test_errors_of_the_driver_are_oserrors_and_a_closed_car_says_so(hardware, car, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.delattr(type(hardware.car), "read_write_std")
+        with pytest.raises(OSError, match="the QCar's driver: AttributeError"):
+            car.read()
     car.close()
-    with pytest.raises(OSError, match="closed"):
-        car.read()
-    with pytest.raises(OSError, match="closed"):
-        car.write(0.0, 0.1)
+    for call in (car.read, lambda: car.write(0.0, 0.1)):
+        with pytest.raises(OSError, match="closed"):
+            call()
     count = len(hardware.calls)
     car.stop()
     assert len(hardware.calls) == count  # the board belongs to somebody else by now
@@ -253,36 +246,29 @@ def test_a_rig_that_a_qcar_has_not_is_refused(hardware, rig, problem):
         open_cameras(setup_with(rig), None)
 
 
-def test_each_camera_shows_its_own_side_late_by_its_latency(hardware):
+def test_each_camera_shows_its_own_side_late_by_its_latency_and_no_picture_twice(
+    hardware, monkeypatch
+):
     cameras = open_cameras(setup_with(SETUP.rig.first(2), latency_ms="20"), None)
     try:
+        front = cameras[0]
         assert [camera.name for camera in cameras] == ["front", "right"]
         assert hardware.cameras.csiLeft is None
         assert hardware.cameras.csiBack is None
-        frame = cameras[0].read(1.0)
+        frame = front.read(1.0)
         assert time.monotonic_ns() - frame.stamp_ns >= 20_000_000
         hardware.pictures = False
-        cameras[0].read(0.05)  # what was under way
-        assert cameras[0].read(0.05) is None
+        front.read(0.05)  # what was under way
+        assert front.read(0.05) is None
         shown = hardware.cameras.csiFront.imageData.copy()
         hardware.pictures = True
-        assert not np.array_equal(cameras[0].read(1.0).image, shown)
+        assert not np.array_equal(front.read(1.0).image, shown)
+        monkeypatch.setattr(hardware.cameras.csiFront, "read", lambda: None)  # it says nothing
+        front.read(0.05)
+        assert front.read(0.05) is None
     finally:
         for camera in cameras:
             camera.close()
-
-
-def test_a_driver_that_repeats_its_picture_gives_no_frame(hardware, monkeypatch):
-    camera, *others = open_cameras(SETUP, None)
-    try:
-        assert camera.read(1.0) is not None
-        maker = hardware.cameras.csiFront
-        monkeypatch.setattr(maker, "read", lambda: None)  # as one that says nothing
-        camera.read(0.05)
-        assert camera.read(0.05) is None
-    finally:
-        for one in (camera, *others):
-            one.close()
 
 
 def test_without_the_makers_software_a_person_hears_where_it_is_from(monkeypatch):

@@ -121,14 +121,14 @@ def test_a_rig_with_finer_figures_keeps_them(recording, tmp_path):
 
 
 @pytest.mark.parametrize("flag", ["--rig", "--vehicle"])
-def test_files_of_another_drive_are_refused(recording, tmp_path, capsys, flag):
+def test_files_of_another_drive_are_refused(recording, tmp_path, refusal, flag):
     setup, path = setup_of(), tmp_path / "other.yaml"
     if flag == "--rig":
         save_rig(path, turned(setup.rig, 0, np.array([0, 0, 0.01])))
     else:
         save_vehicle(path, dataclasses.replace(setup.vehicle, speed_scale=1.2))
-    assert adopt(recording, flag, path, "--out", tmp_path / "out") == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    words = (recording, flag, path, "--out", tmp_path / "out", "--headless")
+    line = refusal("calibrate", "adopt", *words)
     assert str(path) in line
     assert "was driven with" in line
     assert not (tmp_path / "out").exists()
@@ -142,9 +142,8 @@ def test_files_of_another_drive_are_refused(recording, tmp_path, capsys, flag):
         ([], "a rule of"),
     ],
 )
-def test_a_drive_that_has_learnt_nothing_is_refused(tmp_path, capsys, outcomes, says):
+def test_a_drive_that_has_learnt_nothing_is_refused(tmp_path, refusal, outcomes, says):
     path = record(tmp_path / "drive.mcap", outcomes)
-    assert adopt(path, "--out", tmp_path / "out") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
+    words = ("calibrate", "adopt", path, "--out", tmp_path / "out", "--headless")
+    assert says in refusal(*words)
     assert not (tmp_path / "out").exists()

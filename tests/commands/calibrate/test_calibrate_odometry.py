@@ -62,14 +62,6 @@ def recording(tmp_path_factory) -> Path:
     return path
 
 
-def told(capsys, *arguments: str) -> str:
-    """The one line that bad input gets."""
-    assert main(["calibrate", "odometry", *arguments, "--headless"]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    return err
-
-
 def test_a_recording_gives_back_what_was_sensed():
     drive = sensed_drive()
     read = drive_of("drive", inputs_of(drive), worlds.qcar_rig(), worlds.paper_markers())
@@ -115,23 +107,10 @@ def test_what_is_fixed_stays(capsys, tmp_path, recording):
     assert "kept" in capsys.readouterr().out
 
 
-def test_a_marker_that_is_elsewhere_is_not_blamed_on_the_odometry(capsys, tmp_path, recording):
+def test_a_marker_that_is_elsewhere_is_not_blamed_on_the_odometry(refusal, tmp_path, recording):
     """A map whose marker has another id shows nothing."""
     path = tmp_path / "markers.yaml"
     save_markers(path, dataclasses.replace(worlds.paper_markers(), ids=(7,)))
-    line = told(capsys, str(recording), "--markers", str(path))
+    line = refusal("calibrate", "odometry", recording, "--markers", path, "--headless")
     assert "eights.mcap" in line
     assert "seen 0 times" in line
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("nowhere.mcap",), "nowhere.mcap: there is no such recording"),
-        (("tests",), "is no recording of jaxnav (.mcap): a ROS bag needs --topics"),
-        (("a.mcap", "--wheelbase-sigma-m", "0"), "--wheelbase-sigma-m: must be from 0.001"),
-        (("a.mcap", "--fix", "wheelbase_m", "--wheelbase-sigma-m", "0.001"), "leave it out of"),
-    ],
-)
-def test_bad_input_gets_one_line(capsys, arguments, says):
-    assert says in told(capsys, *arguments)

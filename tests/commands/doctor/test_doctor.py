@@ -85,21 +85,6 @@ def test_a_check_that_breaks_hides_no_other(capsys, monkeypatch):
     assert lines_with(out, "ok ", "compile cache")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        ("--frame front", "jaxnav doctor: --frame: expected CAMERA=IMAGE, got 'front'"),
-        ("--option speed", "jaxnav doctor: --option: expected KEY=VALUE, got 'speed'"),
-        ("--speed", "jaxnav doctor: Unrecognized options: --speed"),
-    ],
-)
-def test_wrong_usage_is_one_line(capsys, arguments, line):
-    assert cli.main(["doctor", *arguments.split()]) == cli.EXIT_BAD_INPUT
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith(line)
-
-
 def test_pictures_are_named_by_their_cameras(capsys, tmp_path):
     image = tmp_path / "a=b.png"
     cv2.imwrite(str(image), np.full((410, 820), 90, np.uint8))

@@ -143,34 +143,6 @@ def test_a_real_photograph(data_dir, located, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (("missing.png", *CAMERA), "missing.png: can't be read: no such file"),
-        (("{tmp}/text.png", *CAMERA), "text.png: is not an image"),
-        (("{tmp}/empty.png", *CAMERA), "empty.png: is not an image"),
-        (("{tmp}/small.png", *CAMERA), "is 64 x 48 pixels, but --camera"),
-        (("{tmp}/small.png", *CAMERA[:4], "--marker-size-m", "0"), "--marker-size-m: must be from"),
-        (("{tmp}/small.png", *CAMERA[:4], "--marker-size-m", "x"), "--marker-size-m"),
-        (("{tmp}/small.png", *CAMERA[:2], *CAMERA[4:]), "front"),
-        (("{tmp}/small.png", *CAMERA, "--family", "tag99h1"), "tag99h1"),
-        (("{tmp}/small.png", "--camera", "none.yaml", *CAMERA[4:]), "none.yaml"),
-        (("{tmp}/small.png", "--camera", "{tmp}/zero.yaml", *CAMERA[4:]), "intrinsics"),
-        (("{tmp}/small.png", *CAMERA, "--out", "{tmp}/a.pdf"), "--out: must end in .png or .jpg"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, args, message):
-    (tmp_path / "text.png").write_text("not an image")
-    (tmp_path / "empty.png").write_bytes(b"")
-    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((48, 64), np.uint8))
-    write_camera(tmp_path / "zero.yaml", [0, 1, 2, 3], [64, 48])
-    code = locate(*(str(arg).format(tmp=tmp_path) for arg in args))
-    error = capsys.readouterr().err
-    assert code == 2
-    assert len(error.strip().splitlines()) == 1
-    assert message in error
-
-
-@pytest.mark.parametrize(
     ("changed", "note"),
     [
         (("--marker-size-m", "86"), "86 is 86 m: 0.086 if 86 are mm, 0.86 if they are cm"),

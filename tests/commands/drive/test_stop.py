@@ -89,29 +89,6 @@ def test_a_driver_that_hangs_is_not_waited_for(tmp_path):
     assert ran.stdout.endswith("HAS NOT HEARD THAT IT MUST STOP: its driver hangs\n")
 
 
-@pytest.mark.parametrize(
-    ("told", "line"),
-    [
-        ("--car nobody", "--car: there is no 'nobody'"),
-        ("--car sim", "--car: sim ends with its drive: nothing is left to stop"),
-        ("--car tests.helpers.plain_car:open_curious_vehicle --option log=x",
-         "--car tests.helpers.plain_car:open_curious_vehicle: can't be opened by itself: it looks"),
-        ("--car tests.helpers.plain_car:open_vehicle --vehicle bad.yaml",
-         "bad.yaml: steering_limit_rad: missing"),
-        ("--car tests.helpers.plain_car:open_vehicle --vehicle odd.yaml",
-         "odd.yaml: turn_limit_radps: must be a finite number, got 'fast'"),
-    ],
-)  # fmt: skip
-def test_bad_input_is_one_line(told, line, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    Path("bad.yaml").write_text("wheelbase_m: 0.3\n")
-    Path("odd.yaml").write_text(BASE.replace("3.0", "fast"))
-    assert main(["stop", *told.split()]) == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith(f"jaxnav stop: {line}")
-
-
 def test_a_plug_in_finds_the_same_numbers_as_in_a_drive(tmp_path):
     """What is read here without JAX, against the loader that has it."""
     from jaxnav.files import load_vehicle

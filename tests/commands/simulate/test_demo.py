@@ -129,29 +129,6 @@ def test_another_route_marker_and_noise_with_the_same_command(tmp_path, capsys):
     assert f"OpenCV, first pose: reached all waypoints in {count} of 2 drives; " in told
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--markers", "{qcar}/rig.yaml"], "rig.yaml"),
-        (["--vehicle", "{tmp}/vehicle.yaml"], "vehicle.yaml: wheelbase_m"),
-        (["--params", "{tmp}/params.yaml"], "parameters.motion.vision_floor: must have 3 entries"),
-        (["--exposure-ms", "60"], "--exposure-ms: the last row would be read after"),
-        (["--out", "{tmp}/vehicle.yaml"], "is a file, not a folder"),
-    ],
-)
-def test_bad_input_is_one_line_and_exit_code_2(tmp_path, capsys, flags, message):
-    vehicle = (QCAR / "vehicle.yaml").read_text().replace("wheelbase_m: 0.256", "wheelbase_m: -1")
-    (tmp_path / "vehicle.yaml").write_text(vehicle)
-    write_params(tmp_path / "params.yaml", {"motion.vision_floor": [1] * 6})
-    out = [] if "--out" in flags else ["--out", str(tmp_path / "out")]
-    code = main(["demo", *(flag.format(tmp=tmp_path, qcar=QCAR) for flag in flags), *out])
-    error = capsys.readouterr().err
-    assert code == 2
-    assert len(error.strip().splitlines()) == 1
-    assert message in error
-    assert not (tmp_path / "out").exists()
-
-
 def test_counts_and_medians_of_several_seeds():
     def drive(reached: bool, error_m: float, worst_m: float) -> dict[str, Any]:
         return {"reached": reached, "position_rmse_m": error_m, "position_worst_m": worst_m}

@@ -247,26 +247,6 @@ def test_what_is_missing_is_kept_and_what_lacks_something_not_resumed(
         assert f"s.json: runs[0].{line}" in err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (["simulate", "--corner-noise-px", "-1"], "--corner-noise-px"),
-        (["simulate", "--resume"], "--resume"),
-        (["simulate", "--laps", "101"], "--laps"),
-        (["simulate", "--laps", "1", "--route", "r.yaml"], "--laps: takes the place of --route"),
-        (["simulate", "--laps", "1", "--scenario", "static"], "--laps: nothing drives in static"),
-        (["simulate", "--base", "omni", "--vehicle", "v.yaml"], "--base: omni takes the place of"),
-        (["simulate", "--scenario", "gyro-late"], "--scenario: gyro-late turns on the spot"),
-        (["reliability", "nowhere.bag"], "nowhere.bag"),
-    ],
-)
-def test_bad_input_is_one_line(arguments, told, capsys):
-    assert main([*arguments, *(["--headless"] if "--resume" not in arguments else [])]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert told in lines[0]
-
-
 def test_random_views_are_drawn(tmp_path, capsys):
     assert main(["reliability", "--frames", "200", "--headless", "--out", str(tmp_path)]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())

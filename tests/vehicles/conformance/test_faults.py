@@ -7,7 +7,6 @@ import jax
 import numpy as np
 import pytest
 
-from jaxnav.cli import main
 from jaxnav.core.navigator import Navigator, Output
 from jaxnav.detection import make_detector
 from jaxnav.drive.expect import Region, expect_corners
@@ -156,11 +155,3 @@ def test_rows_have_names_of_their_own():
     assert len(set(names)) == len(names)
     assert set(names) >= OFTEN
     assert all(isinstance(row, FaultRow) and np.isfinite(row.drive_s) for row in MATRIX)
-
-
-def test_a_fault_that_is_not_there_is_one_line(capsys, monkeypatch):
-    monkeypatch.setattr("jaxnav.commands.drive.faults.configure_jax", lambda **_: None)
-    assert main(["faults", "--only", "earthquake"]) == 2
-    error = capsys.readouterr().err.strip().splitlines()
-    assert len(error) == 1
-    assert "--only: names no fault" in error[0]
