@@ -218,16 +218,19 @@ def test_cameras_show_what_was_found_when_it_was_found(drive):
     assert cameras[FRONT].read(60.0) is None
 
 
-def test_cameras_come_by_their_names_in_whatever_rig(drive):
-    order = [2, 0]
-    rig = SETUP.rig.first(3)
-    swapped = dataclasses.replace(rig.first(2), names=tuple(rig.names[c] for c in order))
-    setup = dataclasses.replace(setup_with(drive=str(drive)), rig=swapped)
-    cameras = open_cameras(setup, ReplayVehicle(setup))
-    assert [camera.name for camera in cameras] == list(swapped.names)
-    shown = [frames_of(camera, 1)[0].detections for camera in cameras]
-    for found, original in zip(shown, INPUTS[1].frames[::-1], strict=True):
+def test_cameras_come_by_their_names_in_whatever_rig_or_are_refused(drive):
+    setup, rig = setup_with(drive=str(drive)), SETUP.rig.first(2)
+    swapped = dataclasses.replace(setup, rig=dataclasses.replace(rig, names=("rear", "front")))
+    shown = open_cameras(swapped, ReplayVehicle(swapped))
+    assert [camera.name for camera in shown] == ["rear", "front"]
+    for camera, original in zip(shown, INPUTS[1].frames[::-1], strict=True):
+        found = frames_of(camera, 1)[0].detections
         assert np.array_equal(found.corners_px, original.detections.corners_px)
+    with pytest.raises(BadInput, match="--cameras: replay shows what --car replay has"):
+        open_cameras(setup, GoodVehicle(setup))
+    other = dataclasses.replace(setup, rig=dataclasses.replace(rig.first(1), names=("top",)))
+    with pytest.raises(BadInput, match=r"--rig: .*drive.mcap has no camera 'top': it has front,"):
+        open_cameras(other, ReplayVehicle(other))
 
 
 def pictures(topic="/camera/front", size_px=(820, 410), last: object = b"no jpeg"):
@@ -265,16 +268,6 @@ def test_images_that_are_not_there_or_not_the_rigs_are_refused(tmp_path, images,
         open_cameras(setup, ReplayVehicle(setup))
     assert str(path) in str(caught.value)
     assert problem in str(caught.value)
-
-
-def test_cameras_that_were_not_recorded_are_refused(drive):
-    setup = setup_with(drive=str(drive))
-    with pytest.raises(BadInput, match="--cameras: replay shows what --car replay has"):
-        open_cameras(setup, GoodVehicle(setup))
-    other = dataclasses.replace(SETUP.rig.first(1), names=("top",))
-    other_setup = dataclasses.replace(setup, rig=other)
-    with pytest.raises(BadInput, match=r"--rig: .*drive.mcap has no camera 'top': it has front,"):
-        open_cameras(other_setup, ReplayVehicle(other_setup))
 
 
 BACKWARDS = (INPUTS[1], INPUTS[0])
@@ -392,12 +385,11 @@ def test_flags_go_before_the_recordings_own_files(tmp_path, drive, monkeypatch):
     save_rig(tmp_path / "rig.yaml", SETUP.rig.first(1))
     options = ("--option", f"drive={drive}", "--rig", str(tmp_path / "rig.yaml"))
     assert cli.main(["run", "--float64", "--headless", *NAMES, *options]) == 2
-    own = given[0]
-    assert own.rig.names == ("front",)
-    assert own.route == SETUP.route
+    (own,) = given
+    assert (own.rig.names, own.route) == (("front",), SETUP.route)
+    assert own.selector == "multi-hypothesis"
     assert np.array_equal(own.markers.corners_world_m, SETUP.markers.corners_world_m)
     assert own.vehicle.wheelbase_m == SETUP.vehicle.wheelbase_m
-    assert own.selector == "multi-hypothesis"
 
 
 def test_a_base_tells_its_twist_and_its_gyro_again(tmp_path, now):

@@ -1,5 +1,6 @@
 """The checks for plug-ins: a good plug-in passes, and each fault of a bad one is named."""
 
+import dataclasses
 import itertools
 import threading
 import time
@@ -8,9 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from jaxnav.core.models.imu import GYROS
+from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.detection.types import Detections
-from jaxnav.drive.interfaces import Frame, Odometry
+from jaxnav.drive.interfaces import Frame, GyroReading, Odometry, TwistOdometry
 from jaxnav.vehicles.conformance import check_cameras, check_vehicle
+from jaxnav.vehicles.sim import open_vehicle
 from tests.helpers.setups import FULL_THROTTLE, GoodCamera, GoodVehicle, good_cameras, setup_with
 
 SETUP = setup_with()
@@ -271,3 +275,89 @@ def test_a_camera_may_detect_by_itself():
     check_cameras(factory((2, 4, 2)), SHORT_RIG)
     with pytest.raises(AssertionError, match=r"the corners of .* have the shape \(2, 8\)"):
         check_cameras(factory((2, 8)), SHORT_RIG)
+
+
+# --- bases that are no cars ---
+
+
+BASE = TwistBase.create(1.0, 4.0, 0.15, left_limit_mps=0.5, gyro=GYROS["consumer"])
+BASE_SETUP = dataclasses.replace(SETUP, vehicle=BASE)
+
+
+class GoodBase:
+    """Stands where it is, and knows what it was last told."""
+
+    timeout_s = 0.2
+
+    def __init__(self, setup):
+        self.told, self.most, self.closed = (0.0, 0.0, 0.0), [0.0, 0.0, 0.0], False
+
+    def read(self):
+        return TwistOdometry(time.monotonic_ns(), 0.0, 0.0, 0.0)
+
+    def read_gyro(self):
+        return [GyroReading(time.monotonic_ns(), 0.01)]
+
+    def write(self, forward_mps, left_mps, turn_radps):
+        if self.closed:
+            raise OSError("closed")
+        self.told = forward_mps, left_mps, turn_radps
+        self.most = [max(a, abs(b)) for a, b in zip(self.most, self.told, strict=True)]
+
+    def stop(self):
+        self.told = 0.0, 0.0, 0.0
+
+    def close(self):
+        self.stop()
+        self.closed = True
+
+
+def largest(base) -> float:
+    return max(map(abs, base.told))
+
+
+def test_good_bases_keep_their_promises_and_are_told_all_their_limits():
+    opened = []
+    check_vehicle(lambda setup: opened.append(GoodBase(setup)) or opened[0], BASE_SETUP, largest)
+    assert opened[0].most == [1.0, 0.5, 4.0]
+    check_vehicle(open_vehicle, BASE_SETUP)
+
+
+class StopForgetsTheTurn(GoodBase):
+    def stop(self):
+        self.told = 0.0, 0.0, self.told[2]
+
+    def write(self, forward_mps, left_mps, turn_radps):
+        super().write(forward_mps, left_mps, turn_radps + 0.1)
+
+
+def broken_base(**changes):
+    return type("Broken", (GoodBase,), {name: lambda self, c=c: c() for name, c in changes.items()})
+
+
+now_ns = time.monotonic_ns
+
+
+@pytest.mark.parametrize(
+    ("base", "sentence"),
+    [
+        (
+            broken_base(read=lambda: Odometry(now_ns(), 0.0, 0.0)),
+            r"read\(\) gives Odometry\(.*expected a TwistOdometry",
+        ),
+        (
+            broken_base(read=lambda: TwistOdometry(now_ns(), 0.0, 0.0, float("nan"))),
+            "turn_radps of a valid TwistOdometry must be a finite number, not nan",
+        ),
+        (broken_base(read_gyro=lambda: [GyroReading(time.time_ns(), 0.01)]), "GyroReading"),
+        (
+            broken_base(read_gyro=lambda: [0.01]),
+            r"read_gyro\(\) gives 0.01, expected a Gyro",
+        ),
+        (StopForgetsTheTurn, r"the throttle is .* after stop\(\), it must be 0"),
+    ],
+)
+def test_a_broken_promise_of_a_base_is_named(monkeypatch, base, sentence):
+    monkeypatch.setattr("jaxnav.vehicles.conformance.vehicle._READINGS", 6)
+    with pytest.raises(AssertionError, match=sentence):
+        check_vehicle(base, BASE_SETUP, largest)
