@@ -24,7 +24,7 @@ def trees(draw):
     return {"first": leaves[:2], "others": tuple(leaves[2:]), "none": None}
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(trees())
 def test_a_tree_is_found_again_bit_for_bit(tree):
     layout = PackedLayout.of(tree)
@@ -38,7 +38,7 @@ def test_a_tree_is_found_again_bit_for_bit(tree):
             assert np.asarray(one).tobytes() == other.tobytes()
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(trees())
 def test_what_is_written_to_the_room_is_in_the_vectors(tree):
     packed, views = PackedLayout.of(tree).room()
