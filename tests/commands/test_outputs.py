@@ -4,8 +4,6 @@ result don't lose each other's."""
 import json
 import os
 import signal
-import subprocess
-import sys
 import typing
 from pathlib import Path
 
@@ -16,8 +14,8 @@ from jaxnav.commands import COMMANDS, OUTPUTS
 from jaxnav.errors import BadInput
 from jaxnav.files import atomic_path, atomic_write
 from jaxnav.files.writing import atomic_write_all, refuse_overwriting, require_writable, sole_writer
+from tests.helpers.processes import python
 
-ROOT = Path(__file__).parents[2]
 # What is typed, the file that would be destroyed, and the flag that is to be named.
 OVERWRITING = [
     ("run --car replay --option drive=a.mcap --record a.mcap", "a.mcap", "--record"),
@@ -248,15 +246,7 @@ print(child)
 
 
 def test_of_a_killed_process_nothing_stays_and_nothing_is_barred():
-    run = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", CHILDREN],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        timeout=120,
-    )  # fmt: skip
-    held = int(run.stdout)
+    held = int(python("-W", "ignore", "-c", CHILDREN).communicate(timeout=120)[0])
     try:
         assert len(list(Path().glob(".jaxnav-*"))) == 3
         with pytest.raises(BadInput, match=r"held\.txt: is being written by another process"):

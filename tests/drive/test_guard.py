@@ -3,11 +3,8 @@
 import math
 import signal
 import subprocess
-import sys
-import textwrap
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +14,7 @@ from hypothesis import strategies as st
 from jaxnav.drive.guard import TIMEOUT_S, Guard
 from jaxnav.drive.limits import Limits
 from jaxnav.drive.standing_clock import WaitingClock
+from tests.helpers.processes import python
 
 LIMITS = Limits(steering_rad=0.5, steering_rate_radps=5.0, throttle=0.3)
 SLACK_S = 0.15  # of a machine that does something else
@@ -305,8 +303,7 @@ def test_what_reaches_the_vehicle_is_inside_the_limits(commands):
 
 
 PROGRAM = """
-import math, signal, sys, threading, time
-sys.path.insert(0, {root!r})
+import math, sys, threading, time
 from jaxnav.drive.guard import Guard
 from jaxnav.drive.limits import Limits
 from jaxnav.drive.signals import Signals
@@ -356,12 +353,9 @@ kept = [os.dup(0) for _ in range(1500)]
 
 @pytest.mark.parametrize("name", ENDINGS)
 def test_however_a_program_ends_zero_throttle_is_the_last_word(name):
-    root = str(Path(__file__).resolve().parents[2])
     before = MANY_FILES if "many files" in name else ""
-    source = textwrap.dedent(PROGRAM).format(root=root, ending=ENDINGS[name], before=before)
-    process = subprocess.Popen(
-        [sys.executable, "-c", source], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
+    source = PROGRAM.format(ending=ENDINGS[name], before=before)
+    process = python("-c", source, stderr=subprocess.DEVNULL)
     since_ns = None
     if name.startswith("SIG"):
         for _ in range(30):

@@ -5,10 +5,8 @@ import os
 import resource
 import signal
 import subprocess
-import sys
 import time
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -19,8 +17,8 @@ from jaxnav.errors import BadInput
 from tests.helpers import plain_car
 from tests.helpers.dying_parent import ENDS, LIMITS, make_setup
 from tests.helpers.plain_car import wait_for, words
+from tests.helpers.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[2]
 STOPS_S = 0.2
 REPLACED_S = 2.0
 SLACK_S = 0.3  # of a machine that does something else; measured without it by bench_stop.py
@@ -88,15 +86,8 @@ OFTEN = {"kill -9", "SIGSTOP", "no memory", "held lock"}
 )
 def test_however_the_process_that_computes_ends_the_vehicle_stands(tmp_path, how):
     log = tmp_path / "log"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.helpers.dying_parent", str(log), how, "0.1"],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    with process:
+    command = ("-m", "tests.helpers.dying_parent", log, how, 0.1)
+    with python(*command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
         try:
             ended_ns = int(process.stdout.readline())
             wait_for(lambda: words(log)[-1].throttle == 0, 5.0)
@@ -403,7 +394,4 @@ def test_plug_ins_of_hardware_need_neither_jax_nor_opencv():
         "import sys, jaxnav.vehicles.qcar, jaxnav.vehicles.ros2, jaxnav.drive.guard_process\n"
         "print([name for name in ('jax', 'cv2', 'jaxlib') if name in sys.modules])"
     )
-    told = subprocess.run(
-        [sys.executable, "-c", source], capture_output=True, text=True, check=True
-    )
-    assert told.stdout == "[]\n"
+    assert python("-c", source).communicate()[0] == "[]\n"

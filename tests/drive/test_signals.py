@@ -3,16 +3,14 @@
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
 from jaxnav.drive.signals import Interrupted, Signals
+from tests.helpers.processes import python
 
-ROOT = Path(__file__).resolve().parents[2]
 ALL = ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1"]
 
 
@@ -116,13 +114,7 @@ signals.check()
 
 
 def ended(hold, sleeps, name):
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM.format(hold=hold, sleeps=sleeps)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = python("-c", PROGRAM.format(hold=hold, sleeps=sleeps), stderr=subprocess.PIPE)
     process.stdout.readline()
     begin_s = time.monotonic()
     process.send_signal(getattr(signal, name))

@@ -158,6 +158,7 @@ def test_a_gyro_that_fails_is_named_and_the_drive_goes_on_without(setup, edit, f
     assert not steps[-1].outcome.faults
 
 
+@pytest.mark.long
 def test_a_wheel_that_runs_away_is_refused(setup):
     """Ten times the turn rate for half a second, then nothing for half a second."""
 
