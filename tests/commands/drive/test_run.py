@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxnav.cli import EXIT_BAD_INPUT, main
 from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.files import calib_dir, save_vehicle, write_params
@@ -23,9 +22,9 @@ from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_setup import DriveSetup
 from tests.helpers import plain_cameras, plain_car, recorded_vehicle
 from tests.helpers.late import MAIN
-from tests.helpers.recorded_vehicle import Word, words
+from tests.helpers.processes import ROOT
+from tests.helpers.recorded_vehicle import words
 
-ROOT = Path(__file__).resolve().parents[3]
 STOPS_S = 0.2  # after a signal, at the latest
 SLACK_S = 0.3  # of a machine that does something else
 REPLACED_S = 2.0  # after the end of a drive whose guard hangs
@@ -53,53 +52,40 @@ class Workplace:
     def command(self, *arguments: object) -> list[str]:
         return [sys.executable, "-c", MAIN, "run", *map(str, arguments)]
 
-    def driving(self, log: Path, record: Path) -> list[str]:
-        """With parameters of its own."""
+    def driving(self, folder: Path, moved: bool) -> list[str]:
+        """Of the simulated car with parameters of its own, or of one in the guard's process, which
+        is patient with a busy machine."""
+        car = (recorded_vehicle.NAME, "--cameras", "sim", "--headless")
+        car = (*car, "--params", self.folder / "params.yaml")
+        if moved:
+            car = (plain_car.NAME, "--cameras", plain_cameras.NAME, "--timeout-s", 3)
         return self.command(
-            *("--car", recorded_vehicle.NAME, "--cameras", "sim", "--option", f"log={log}"),
-            *("--route", self.folder / "route.yaml", "--record", record),
-            *("--params", self.folder / "params.yaml", "--headless", *DECODES),
+            *("--car", *car, "--option", f"log={folder / 'told'}", *DECODES),
+            *("--route", self.folder / "route.yaml", "--record", folder / "drive.mcap"),
         )
-
-    def moved(self, log: Path, record: Path) -> list[str]:
-        """Of a car in the guard's process, which is patient with a busy machine."""
-        return self.command(
-            *("--car", plain_car.NAME, "--cameras", plain_cameras.NAME),
-            *("--option", f"log={log}", "--route", self.folder / "route.yaml"),
-            *("--record", record, "--timeout-s", 3, *DECODES),
-        )
-
-
-@dataclass(frozen=True)
-class Ended:
-    """A drive that is over."""
-
-    code: int
-    out: str
-    err: str
-    told: list[Word]
 
 
 @dataclass(frozen=True)
 class Running:
-    """A drive that goes on."""
+    """A drive that goes on. `words` are those of its vehicle, by whichever process."""
 
     process: subprocess.Popen
-    log: Path
-    record: Path
+    folder: Path
+    words: Callable[[Path], list]
 
-    def ended(self) -> Ended:
+    @property
+    def record(self) -> Path:
+        return self.folder / "drive.mcap"
+
+    def ended(self) -> tuple[int, str, str]:
+        """Its exit code, and what it printed; the vehicle stands."""
         out, err = self.process.communicate(timeout=60)
-        return Ended(self.process.returncode, out, err, self.told())
+        assert self.told()[-1].throttle == 0
+        return self.process.returncode, out, err
 
-    def told(self) -> list[Word]:
-        """What the vehicle was told so far, by whichever process."""
-        if "plain_car" in str(self.process.args):
-            return [
-                Word(word.stamp_ns, word.stamp_ns, word.throttle)
-                for word in plain_car.words(self.log)
-            ]
-        return words(self.log)
+    def told(self) -> list:
+        """What the vehicle was told so far."""
+        return self.words(self.folder / "told")
 
     def stands_after_s(self, since_ns: int) -> float:
         """How long it took until it was told nothing but zero, which must be soon."""
@@ -107,7 +93,9 @@ class Running:
         while self.told()[-1].throttle != 0:
             assert time.monotonic() < end_s, "the last word is a throttle"
             time.sleep(0.02)
-        return (stood_ns(self.told()) - since_ns) / 1e9
+        told = self.told()
+        last = max(index for index, word in enumerate(told) if word.throttle)
+        return (told[last + 1].stamp_ns - since_ns) / 1e9
 
 
 @pytest.fixture(scope="module")
@@ -116,12 +104,6 @@ def workplace(tmp_path_factory) -> Workplace:
     (folder / "route.yaml").write_text(ROUTE)
     write_params(folder / "params.yaml", TUNED)
     return Workplace(folder)
-
-
-def stood_ns(told: list[Word]) -> int:
-    """Since when it was told nothing but zero."""
-    last = max(index for index, word in enumerate(told) if word.throttle)
-    return told[last + 1].stamp_ns
 
 
 @contextmanager
@@ -139,12 +121,11 @@ def driving(
         terminal: what it was started from.
         more: arguments.
     """
-    log, record = folder / "told", folder / "drive.mcap"
-    command, first = (workplace.moved if moved else workplace.driving)(log, record), []
+    first = []
     if terminal is not None:  # it is that of a session's first process, which opens it
         first = ["/bin/sh", "-c", f'exec "$@" < {os.ttyname(terminal)}', "sh"]
     process = subprocess.Popen(
-        [*first, *command, *more],
+        [*first, *workplace.driving(folder, moved), *more],
         cwd=folder,
         env=workplace.environment(),
         stdout=subprocess.PIPE,
@@ -154,7 +135,7 @@ def driving(
     )
     with process:
         try:
-            running = Running(process, log, record)
+            running = Running(process, folder, plain_car.words if moved else words)
             end_s = time.monotonic() + START_S
             while sum(word.throttle != 0 for word in running.told()) < 3:
                 if process.poll() is not None or time.monotonic() > end_s:
@@ -163,12 +144,6 @@ def driving(
             yield running
         finally:
             process.kill()
-
-
-def assert_arrived(ended: Ended) -> None:
-    assert (ended.code, ended.err) == (0, "")
-    assert ended.out.startswith("ended: arrived\n")
-    assert ended.told[-1].throttle == 0
 
 
 @pytest.mark.long
@@ -201,8 +176,9 @@ def test_images_of_any_map_end_no_drive(workplace, tmp_path, family, marker_id):
 
 def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
     with driving(workplace, tmp_path) as drive:
-        ended = drive.ended()
-    assert_arrived(ended)
+        code, out, err = drive.ended()
+    assert (code, err) == (0, "")
+    assert out.startswith("ended: arrived\n")
     log = read_drive(drive.record)
     assert not log.truncated
     assert log.outcomes.done[-1]
@@ -211,7 +187,7 @@ def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
     assert Health.OK in log.outcomes.health
     assert len(log.inputs) == len(log.outcomes.now_ns) > 50
     count = len(log.inputs) + len(log.outcomes.now_ns)
-    assert f"recorded {count} messages in {drive.record}" in ended.out
+    assert f"recorded {count} messages in {drive.record}" in out
 
 
 @pytest.mark.long
@@ -223,7 +199,9 @@ def test_a_simulated_drive_that_was_suspended_goes_on(workplace, tmp_path):
             time.sleep(0.6)
             drive.process.send_signal(signal.SIGCONT)
             time.sleep(0.1)
-        assert_arrived(drive.ended())
+        code, out, err = drive.ended()
+    assert (code, err) == (0, "")
+    assert out.startswith("ended: arrived\n")
 
 
 @pytest.mark.long
@@ -232,11 +210,10 @@ def test_a_signal_stops_the_vehicle_at_once(workplace, tmp_path, number):
     with driving(workplace, tmp_path) as drive:
         signalled_ns = time.monotonic_ns()
         drive.process.send_signal(number)
-        ended = drive.ended()
-    assert (ended.code, ended.err) == (128 + number, "")
-    assert ended.out.startswith(f"ended: {number.name}\n")
-    assert ended.told[-1].throttle == 0
-    assert (stood_ns(ended.told) - signalled_ns) / 1e9 < STOPS_S + SLACK_S
+        code, out, err = drive.ended()
+    assert (code, err) == (128 + number, "")
+    assert out.startswith(f"ended: {number.name}\n")
+    assert drive.stands_after_s(signalled_ns) < STOPS_S + SLACK_S
     log = read_drive(drive.record)
     assert not log.truncated
     assert log.outcomes.throttle.any()
@@ -256,10 +233,10 @@ def test_a_car_in_the_guards_process_stops_when_its_terminal_says_so(workplace, 
             os.write(ours, b"\x1a")  # Ctrl-Z
         assert drive.stands_after_s(signalled_ns) < STOPS_S + SLACK_S
         drive.process.send_signal(signal.SIGINT)  # once more, while it ends: nothing is cut short
-        ended = drive.ended()
-    assert ended.code == 128 + number
-    assert ended.out.startswith(f"ended: {number.name}\n")
-    assert "guard: a process of its own" in ended.out
+        code, out, _ = drive.ended()
+    assert code == 128 + number
+    assert out.startswith(f"ended: {number.name}\n")
+    assert "guard: a process of its own" in out
     if number != signal.SIGHUP:
         os.close(ours)
     assert not read_drive(drive.record).truncated
@@ -274,11 +251,11 @@ def test_a_car_whose_file_says_so_drives_on_after_its_drive_was_suspended(workpl
         drive.process.send_signal(signal.SIGSTOP)
         assert drive.stands_after_s(suspended_ns) < 3.0 + SLACK_S
         drive.process.send_signal(signal.SIGCONT)
-        ended = drive.ended()
-    assert ended.code == 0
-    assert ended.out.startswith("ended: arrived\n")
-    assert "held: no fresh command for " in ended.err
-    assert "drives on: all was well for 2 s" in ended.err
+        code, out, err = drive.ended()
+    assert code == 0
+    assert out.startswith("ended: arrived\n")
+    assert "held: no fresh command for " in err
+    assert "drives on: all was well for 2 s" in err
     log = read_drive(drive.record)
     held = log.outcomes.faults & Fault.HELD != 0
     assert held.any()
@@ -288,12 +265,11 @@ def test_a_car_whose_file_says_so_drives_on_after_its_drive_was_suspended(workpl
 @pytest.mark.long
 def test_the_end_of_the_guards_process_is_the_end_of_the_drive(workplace, tmp_path):
     with driving(workplace, tmp_path, moved=True) as drive:
-        os.kill(plain_car.words(drive.log)[-1].pid, signal.SIGKILL)
-        ended = drive.ended()
-    assert ended.code == 1
-    assert ended.out.startswith("ended: the guard's process was ended by signal 9\n")
-    assert f"{plain_car.NAME} does not stop by itself when all processes here are" in ended.err
-    assert ended.told[-1].throttle == 0  # by another one that was started for it
+        os.kill(drive.told()[-1].pid, signal.SIGKILL)
+        code, out, err = drive.ended()  # stopped by another one that was started for it
+    assert code == 1
+    assert out.startswith("ended: the guard's process was ended by signal 9\n")
+    assert f"{plain_car.NAME} does not stop by itself when all processes here are" in err
 
 
 @pytest.mark.parametrize(
@@ -310,7 +286,7 @@ def test_a_guard_that_hangs_before_the_end_is_replaced_and_that_is_said(
     hangs = tmp_path / "hangs"
     more = ["--option", f"hangs={hangs}", *["--duration-s", "2"] * (end == "time is over")]
     with driving(workplace, tmp_path, moved=True, more=more) as drive:
-        first, *_ = plain_car.words(drive.log)
+        first, *_ = drive.told()
         pid, due_ns = first.pid, first.stamp_ns + 2_000_000_000
         if end == "time is over":  # half a second before
             time.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9 - 0.5))
@@ -321,18 +297,17 @@ def test_a_guard_that_hangs_before_the_end_is_replaced_and_that_is_said(
             drive.process.send_signal(getattr(signal, end))
             time.sleep(0.1)
             drive.process.send_signal(signal.SIGINT)  # once more: nothing is cut short
-        ended = drive.ended()
-    assert ended.out.startswith(f"ended: {end}\n")
-    assert ended.code == 1
-    assert "gave no answer for 0." in ended.err
-    assert "was killed; another one has stopped the vehicle\n" in ended.err
-    assert ended.told[-1].throttle == 0
-    assert plain_car.words(drive.log)[-1].pid != pid
-    assert (stood_ns(ended.told) - due_ns) / 1e9 < REPLACED_S
+        code, out, err = drive.ended()
+    assert code == 1
+    assert out.startswith(f"ended: {end}\n")
+    assert "gave no answer for 0." in err
+    assert "was killed; another one has stopped the vehicle\n" in err
+    assert drive.told()[-1].pid != pid
+    assert drive.stands_after_s(due_ns) < REPLACED_S
 
 
 def test_where_too_few_files_may_be_open_nothing_is_begun(workplace, tmp_path):
-    command = workplace.moved(tmp_path / "told", tmp_path / "drive.mcap")
+    command = workplace.driving(tmp_path, moved=True)
     for files in (5, 63):
         ended = subprocess.run(
             ["/bin/sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command],
@@ -357,7 +332,7 @@ def test_a_terminal_that_is_stuck_holds_up_neither_the_drive_nor_its_end(workpla
         signalled_ns = time.monotonic_ns()
         drive.process.send_signal(signal.SIGTERM)
         assert drive.stands_after_s(signalled_ns) < STOPS_S + SLACK_S
-        assert drive.ended().code == 128 + signal.SIGTERM
+        assert drive.ended()[0] == 128 + signal.SIGTERM
     for end in ends:
         os.close(end)
 
@@ -379,7 +354,7 @@ def test_a_start_that_is_called_off_opens_nothing(workplace, tmp_path, after_s):
     log, record = tmp_path / "told", tmp_path / "drive.mcap"
     record.write_bytes(b"of another day")
     process = subprocess.Popen(
-        workplace.driving(log, record),
+        workplace.driving(tmp_path, moved=False),
         env=workplace.environment(),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -402,9 +377,8 @@ def test_a_start_that_is_called_off_opens_nothing(workplace, tmp_path, after_s):
 def test_a_start_that_is_called_off_while_it_compiles_leaves_no_part_of_a_recording(
     workplace, tmp_path
 ):
-    record = tmp_path / "drive.mcap"
     cold = workplace.environment() | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
-    process = subprocess.Popen(workplace.driving(tmp_path / "told", record), env=cold)
+    process = subprocess.Popen(workplace.driving(tmp_path, moved=False), env=cold)
     with process:
         while process.poll() is None and not list(tmp_path.glob(".*.part")):
             time.sleep(0.002)
@@ -424,7 +398,7 @@ def test_of_a_drive_that_is_killed_the_recording_lacks_less_than_the_last_second
         killed_ns = time.monotonic_ns()
         drive.process.kill()
         assert drive.stands_after_s(killed_ns) < STOPS_S + SLACK_S
-        assert drive.ended().code == -signal.SIGKILL
+        assert drive.ended()[0] == -signal.SIGKILL
     log = read_drive(drive.record)
     assert log.truncated
     assert log.outcomes.throttle.any()
@@ -437,12 +411,12 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
         # No file of the process may grow beyond this any more.
         size = drive.record.stat().st_size + LITTLE_BYTES
         resource.prlimit(drive.process.pid, resource.RLIMIT_FSIZE, (size, size))
-        ended = drive.ended()
-    assert_arrived(ended)
-    assert "left out; " in ended.out
-    assert f"{drive.record}: can't be written: file too large" in ended.out
-    log = read_drive(drive.record)
-    assert log.truncated
+        code, out, err = drive.ended()
+    assert (code, err) == (0, "")
+    assert out.startswith("ended: arrived\n")
+    assert "left out; " in out
+    assert f"{drive.record}: can't be written: file too large" in out
+    assert read_drive(drive.record).truncated
 
 
 @pytest.mark.parametrize(
@@ -453,10 +427,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
         (["--record", "nowhere/drive.mcap"], "nowhere/drive.mcap: can't be written: no such file"),
         (["--record", "/dev/full"], "/dev/full: can't be written: no space left on device"),
         (["--params", "p.yaml"], "p.yaml: parameters.motion.vision_floor: must have 3 entries or"),
-        (
-            ["--vehicle", "base.yaml"],
-            "base.yaml: base omni needs left_limit_mps",
-        ),
+        (["--vehicle", "base.yaml"], "base.yaml: base omni needs left_limit_mps"),
         (["--record-images"], "--record-images: needs --record"),
         (
             ["--cameras", "opencv", "--option", "source.front=/dev/nowhere"],
@@ -465,7 +436,7 @@ def test_a_disk_that_fills_up_while_it_drives_is_no_reason_to_stop(workplace, tm
         (["--period-s", "5"], "--period-s: must be at most 0.1, got 5.0"),
     ],
 )
-def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys, arguments, line):
+def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, refusal, arguments, line):
     monkeypatch.chdir(tmp_path)
     write_params("p.yaml", {"motion.vision_floor": [1.0] * 6})
     save_vehicle("base.yaml", TwistBase.create(1.0, 3.0, 0.1))
@@ -476,8 +447,5 @@ def test_bad_input_gets_one_line_and_nothing_moves(tmp_path, monkeypatch, capsys
     log = tmp_path / "told"
     cameras = [] if "--cameras" in arguments else ["--cameras", "sim"]
     options = [*vehicle, *cameras, "--option", f"log={log}", "--headless"]
-    assert main(["run", *options, *arguments]) == EXIT_BAD_INPUT
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith(f"jaxnav run: {line}")
+    assert refusal("run", *options, *arguments).startswith(f"jaxnav run: {line}")
     assert words(log) == []  # it was not even opened
