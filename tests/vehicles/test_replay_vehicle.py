@@ -270,7 +270,6 @@ def test_images_that_are_not_there_or_not_the_rigs_are_refused(tmp_path, images,
     assert problem in str(caught.value)
 
 
-BACKWARDS = (INPUTS[1], INPUTS[0])
 STRANGER = (Input(at(0), frames=(seen(9, at(0)),)),)
 
 
@@ -279,11 +278,7 @@ STRANGER = (Input(at(0), frames=(seen(9, at(0)),)),)
     [
         ([], "--option drive: missing: the recorded drive (.mcap)"),
         (["drive={tmp}/gone.mcap"], "{tmp}/gone.mcap: can't be read: no such file"),
-        (["drive={tmp}/text.mcap"], "{tmp}/text.mcap: is not an MCAP file"),
-        (["drive={tmp}/empty.mcap"], "{tmp}/empty.mcap: holds no input"),
-        (["drive={tmp}/back.mcap"], "{tmp}/back.mcap: now_ns[1]: is less than"),
         (["drive={tmp}/strange.mcap"], "{tmp}/strange.mcap: /frames.camera: must be from 0 to 3"),
-        (["drive={tmp}/header.mcap"], "{tmp}/header.mcap: header.setup_version: missing"),
         (["drive={tmp}/good.mcap", "images=yes"], "--option images: expected false or true"),
     ],
 )
@@ -294,11 +289,7 @@ def test_bad_input_gets_one_line_before_anything_is_compiled(
         "jaxnav.commands.drive.run.compiled_pilot", lambda *told: pytest.fail("compiles")
     )
     recorded(tmp_path / "good.mcap")
-    (tmp_path / "text.mcap").write_text("a drive?\n" * 9)
-    recorded(tmp_path / "empty.mcap", [])
-    recorded(tmp_path / "back.mcap", BACKWARDS)
     recorded(tmp_path / "strange.mcap", STRANGER)
-    recorded(tmp_path / "header.mcap", header={"rig": {}})
     given = [part for text in options for part in ("--option", text.format(tmp=tmp_path))]
     assert cli.main(["run", "--float64", "--headless", *NAMES, *given]) == 2
     told = capsys.readouterr()

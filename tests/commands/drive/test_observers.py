@@ -3,7 +3,6 @@
 import dataclasses
 import sys
 from contextlib import ExitStack
-from pathlib import Path
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -28,7 +27,6 @@ from jaxnav.detection.types import Detections
 from jaxnav.drive.flags import Fault
 from jaxnav.drive.interfaces import Frame
 from jaxnav.drive.pilot import FrameDetections
-from jaxnav.errors import BadInput
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_setup import DriveSetup
 from tests.commands.calibrate.test_adopt import learnt_outcome, setup_of
@@ -151,10 +149,6 @@ def test_a_recording_that_can_not_keep_up_or_go_on_is_a_fault(setup, tmp_path):
     assert recording.faults == Fault.RECORDER_BEHIND
     assert recording.faults == Fault(0)  # told once for each loss
     assert recording.closing_note.endswith(", 2 left out")
-    with pytest.raises(BadInput, match="can't be written: no such file or directory"):
-        DriveRecorder(tmp_path / "nowhere" / "drive.mcap", setup, images=False)
-    with pytest.raises(BadInput, match="can't be written: no space left on device"):
-        DriveRecorder(Path("/dev/full"), setup, images=False)
 
 
 def test_the_status_line_is_written_five_times_a_second_and_ended(capsys):

@@ -94,24 +94,12 @@ def test_the_best_is_written(tmp_path, changes, capsys):
     with_parameters(NAVIGATOR, {name: jnp.asarray(v) for name, v in written(tmp_path).items()})
 
 
-def test_what_a_stage_found_in_its_last_step_is_written(tmp_path):
-    """By another stage's loss it looks worse than what was written before."""
-
-    def by_stage(x, stage_x, stage):
-        return held_out(x, stage_x, stage) + 1000 * stage
-
-    fit = fitted(tmp_path, asked(held_out=by_stage, stages=2, steps=99))
-    assert fit.stage == 1
-    assert held_out(fit.best_x, None, 0) < held_out(SPACE.start, None, 0) / 10
-    assert_same(written(tmp_path), SPACE.values(fit.best_x))
-
-
 @pytest.mark.parametrize(
     ("changes", "calls"),
     [
         ({"stages": 2, "steps": 40}, 2),
         (NOISY, 2),
-        *(pytest.param(NOISY, calls, marks=pytest.mark.long) for calls in (1, 5)),
+        pytest.param(NOISY, 1, marks=pytest.mark.long),
     ],
 )
 def test_an_interrupted_fit_goes_on_to_the_same_bits(tmp_path, changes, calls, capsys):
@@ -218,18 +206,10 @@ def breaking(x, item, softness):
     return cost(x, item, softness) + 0 * jnp.sqrt(small)
 
 
-@pytest.mark.parametrize("kind", ["smooth", pytest.param("noisy", marks=pytest.mark.long)])
-def test_a_gradient_that_is_not_finite_is_told(tmp_path, kind, capsys):
+def test_a_gradient_that_is_not_finite_is_told(tmp_path, capsys):
     """The step, the parameter, the drive and the frame; and the best so far stays."""
     assert SPACE.start[LAST] > 0.5 > 0.2 > TARGETS[:, LAST].mean()
-    objective = Objective(breaking)
-
-    @jax.jit
-    def evaluate(x, batch, softness):
-        return jax.value_and_grad(objective)(x, batch, softness)
-
-    changes = {"optimiser": Noisy(evaluate, 0.5)} if kind == "noisy" else {}
-    fit = fitted(tmp_path, asked(breaking, **changes), cost=breaking)
+    fit = fitted(tmp_path, asked(breaking), cost=breaking)
     assert fit.ended == "a gradient is not finite"
     assert fit.step > 1
     assert capsys.readouterr().out == (
