@@ -79,19 +79,6 @@ def test_an_exact_gyro_tells_the_turn():
     assert turned_rad == pytest.approx(world.state(end_ns)[2], abs=1e-6)
 
 
-def test_a_gyro_is_as_wrong_as_its_file_says():
-    gyro = dataclasses.replace(EXACT, noise_density=0.001, bias_sigma_radps=0.1)
-    rates = []
-    for seed in range(20):
-        world = world_of(gyro, seed)
-        world.state(BEGIN_NS + S // 2)
-        rates.append([one.turn_radps for one in world.gyro(BEGIN_NS + S // 2)])
-    rates = np.array(rates)
-    assert 0.05 < np.std(rates.mean(axis=1)) < 0.2
-    noise = (rates - rates.mean(axis=1, keepdims=True)).std()
-    assert noise == pytest.approx(0.001 / math.sqrt(0.01), rel=0.1)
-
-
 def test_beyond_its_range_it_tells_its_limit():
     world = world_of(dataclasses.replace(EXACT, saturation_radps=1.0))
     end_ns = told(world, (0.0, 0.0, SPIN_RADPS), 0.5)
