@@ -129,10 +129,7 @@ def test_a_method_that_a_vehicle_lacks_is_named_and_it_is_closed(module, lacking
         (lambda cameras: cameras[:3], "those of the rig: front, right, rear, left"),
         (lambda cameras: None, "gives None, expected a sequence of cameras"),
         (lambda cameras: iter(cameras), "of the class list_iterator, expected a sequence"),
-        (
-            lambda cameras: [*cameras[:2], "rear", cameras[3]],
-            "gives an object of the class str as camera 2, which has no name, read(), close()",
-        ),
+        (lambda cameras: [*cameras[:2], "rear", cameras[3]], "class str as camera 2, which"),
     ],
 )
 def test_cameras_that_are_not_the_rigs_are_refused_and_closed(module, change, problem):

@@ -212,12 +212,7 @@ def of_base(*values, kind=TwistOdometry):
         (readings(speed_mps=0.7), CHASSIS, "warning", "+0.70 m/s, steering +0.01 rad, 20 times"),
         (readings(steering_rad=28.0), CHASSIS, "warning", "reads +28.00 rad, its limit is 0.50"),
         (of_base(0.0, 0.0, 0.01), BASE, "ok", "ahead, +0.00 to the left, turns +0.01 rad/s"),
-        (
-            of_base(0.0, 0.3, 0.5),
-            BASE,
-            "warning",
-            "turns +0.50 rad/s, 20 times the very same",
-        ),
+        (of_base(0.0, 0.3, 0.5), BASE, "warning", "turns +0.50 rad/s, 20 times the very same"),
         (of_base(0.0, 0.0, float("nan")), BASE, "error", "20 of 20 valid readings are no numbers"),
         (of_base(0.0, 0.0, kind=Odometry), BASE, "error", "readings are of the kind Odometry"),
     ],

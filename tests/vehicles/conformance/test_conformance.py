@@ -119,10 +119,7 @@ def backwards(count=itertools.count()):  # noqa: B008
         (broken(stop=None), r"the vehicle has no stop\(\)"),
         (broken(timeout_s="soon"), "timeout_s is no number but 'soon'"),
         (reads(time.monotonic), "stamp_ns of an Odometry must be an int"),
-        (
-            reads(lambda: time.monotonic_ns() - 3_000_000_000),
-            "stamp_ns of an Odometry is 3.* s old: it must be of time.monotonic_ns",
-        ),
+        (reads(lambda: time.monotonic_ns() - 3_000_000_000), "an Odometry is 3.* s old: it must"),
         (
             broken(read=lambda self: self.__dict__.setdefault("first", GoodVehicle.read(self))),
             r"the stamps of read\(\) stood still for 0.5 s",
@@ -136,17 +133,11 @@ def backwards(count=itertools.count()):  # noqa: B008
         (reads(valid=False), r"no reading of read\(\) was valid"),
         (RaisesValueError, r"write\(0.*\) raised ValueError: too fast; only OSError is allowed"),
         (StopWaits, r"stop\(\) took .* s"),
-        (
-            broken(stop=lambda self: threading.Event().wait()),
-            r"stop\(\) did not return within 1.2 s",
-        ),
+        (broken(stop=lambda self: threading.Event().wait()), r"stop\(\) did not return within"),
         (OneThreadOnly, r"stop\(\) raised RuntimeError: wrong thread"),
         (broken(stop=lambda self: None), r"the throttle is 0.3 after stop\(\), it must be 0"),
         (ReadDrivesOn, "the throttle is 0.3 when it is read after stop"),
-        (
-            broken(close=lambda self: setattr(self, "closed", True)),
-            r"the throttle is 0.3 after close\(\), it must be 0",
-        ),
+        (broken(close=lambda self: setattr(self, "closed", True)), r"is 0.3 after close\(\)"),
         (
             broken(write=lambda self, steering_rad, throttle: setattr(self, "throttle", throttle)),
             r"the throttle is 0.3 when it is written after close\(\)",
@@ -185,7 +176,7 @@ def test_good_cameras_pass():
     assert seen[1] is given
 
 
-def broken_camera(**changes):
+def eyes(**changes):
     """Both cameras of the rig with other methods."""
     broken = type("Broken", (GoodCamera,), changes)
     return lambda setup, vehicle: [
@@ -212,46 +203,26 @@ def in_one_buffer(self):
     [
         (lambda s, v: None, "the factory gives no sequence of cameras"),
         (lambda s, v: [SimpleNamespace(name="front")], r"camera 0 has no read\(\), close\(\)"),
+        (lambda s, v: good_cameras(s, v)[::-1], "the cameras are right, front, those of the rig"),
+        (eyes(stamp_ns=lambda self: 7), "stamp_ns of a frame of the camera front is .* s old"),
         (
-            lambda s, v: good_cameras(s, v)[::-1],
-            "the cameras are right, front, those of the rig front, right",
-        ),
-        (
-            broken_camera(stamp_ns=lambda self: 7),
-            "stamp_ns of a frame of the camera front is .* s old",
-        ),
-        (
-            broken_camera(
-                stamp_ns=lambda self: self.__dict__.setdefault("first", time.monotonic_ns())
-            ),
+            eyes(stamp_ns=lambda self: self.__dict__.setdefault("first", time.monotonic_ns())),
             "the camera front gives the same or an older stamp again",
         ),
+        (eyes(image=lambda self: GoodCamera.image(self).T), r"shape \(820, 410\), the rig says"),
+        (eyes(image=lambda self: None), "holds neither an image nor detections"),
+        (eyes(image=in_one_buffer), "the camera front changes the image of a frame"),
         (
-            broken_camera(image=lambda self: GoodCamera.image(self).T),
-            r"has the shape \(820, 410\), the rig says 820x410",
-        ),
-        (broken_camera(image=lambda self: None), "holds neither an image nor detections"),
-        (broken_camera(image=in_one_buffer), "the camera front changes the image of a frame"),
-        (
-            broken_camera(read=lambda self, timeout_s: np.zeros((410, 820), np.uint8)),
+            eyes(read=lambda self, timeout_s: np.zeros((410, 820), np.uint8)),
             "expected a Frame or None",
         ),
         (
-            broken_camera(read=lambda self, timeout_s: self.closed.wait(0.4) or None),
+            eyes(read=lambda self, timeout_s: self.closed.wait(0.4) or None),
             r"read\(0\) of the camera front took 0.4",
         ),
-        (
-            broken_camera(read=lambda self, timeout_s: 1 / 0),
-            r"read\(0\) of the camera front raised ZeroDivisionError",
-        ),
-        (
-            broken_camera(read=read_forever),
-            r"a read\(\) of the camera front that waits while close\(\) is called did not return",
-        ),
-        (
-            broken_camera(close=lambda self: self.closed.set() or 1 / 0),
-            r"close\(\) of the camera front raised ZeroDivisionError",
-        ),
+        (eyes(read=lambda self, timeout_s: 1 / 0), r"front raised ZeroDivisionError"),
+        (eyes(read=read_forever), r"a read\(\) of the camera front that waits while close\(\) is"),
+        (eyes(close=lambda self: self.closed.set() or 1 / 0), r"close\(\) of .* raised ZeroDiv"),
     ],
 )
 def test_a_broken_promise_of_a_camera_is_named(factory, sentence, monkeypatch):
@@ -270,7 +241,7 @@ def test_a_camera_may_detect_by_itself():
             frame = GoodCamera.read(self, timeout_s)
             return frame and Frame(frame.stamp_ns, detections=found)
 
-        return broken_camera(read=read)
+        return eyes(read=read)
 
     check_cameras(factory((2, 4, 2)), SHORT_RIG)
     with pytest.raises(AssertionError, match=r"the corners of .* have the shape \(2, 8\)"):
@@ -331,7 +302,7 @@ class StopForgetsTheTurn(GoodBase):
         super().write(forward_mps, left_mps, turn_radps + 0.1)
 
 
-def broken_base(**changes):
+def base_of(**changes):
     return type("Broken", (GoodBase,), {name: lambda self, c=c: c() for name, c in changes.items()})
 
 
@@ -342,18 +313,15 @@ now_ns = time.monotonic_ns
     ("base", "sentence"),
     [
         (
-            broken_base(read=lambda: Odometry(now_ns(), 0.0, 0.0)),
+            base_of(read=lambda: Odometry(now_ns(), 0.0, 0.0)),
             r"read\(\) gives Odometry\(.*expected a TwistOdometry",
         ),
         (
-            broken_base(read=lambda: TwistOdometry(now_ns(), 0.0, 0.0, float("nan"))),
+            base_of(read=lambda: TwistOdometry(now_ns(), 0.0, 0.0, float("nan"))),
             "turn_radps of a valid TwistOdometry must be a finite number, not nan",
         ),
-        (broken_base(read_gyro=lambda: [GyroReading(time.time_ns(), 0.01)]), "GyroReading"),
-        (
-            broken_base(read_gyro=lambda: [0.01]),
-            r"read_gyro\(\) gives 0.01, expected a Gyro",
-        ),
+        (base_of(read_gyro=lambda: [GyroReading(time.time_ns(), 0.01)]), "GyroReading"),
+        (base_of(read_gyro=lambda: [0.01]), r"read_gyro\(\) gives 0.01, expected a Gyro"),
         (StopForgetsTheTurn, r"the throttle is .* after stop\(\), it must be 0"),
     ],
 )
