@@ -85,7 +85,7 @@ def test_a_video_is_played_once_from_its_beginning_at_its_rate(video):
         ),
         (
             {"source__front": "VIDEO", "source__right": "no.avi"},
-            "right: there is no device or file",
+            "there is no device or file",
         ),
         ({"source__front": "/dev/video987", "source__right": "VIDEO"}, "video987 can't be opened"),
         (
