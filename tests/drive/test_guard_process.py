@@ -63,12 +63,11 @@ class Drive:
     def driven(self):
         return [word for word in words(self.log) if word.throttle]
 
-    def stood_ns(self):
-        """Since when it was told nothing but zero."""
+    def stands(self):
+        """Wait until the last word is a stop; the first one of those that nothing came after."""
+        wait_for(lambda: words(self.log)[-1].throttle == 0)
         told = words(self.log)
-        last = max(index for index, word in enumerate(told) if word.throttle)
-        assert len(told) > last + 1, "the last word was a throttle"
-        return told[last + 1].stamp_ns
+        return told[max(index for index, word in enumerate(told) if word.throttle) + 1]
 
 
 @pytest.fixture
@@ -105,8 +104,7 @@ def test_commands_that_stop_coming_stop_it(drive):
     since_ns = drive.driven()[-1].stamp_ns
     wait_for(lambda: drive.guard.tripped)
     assert "no fresh command" in drive.guard.reason
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert (drive.stood_ns() - since_ns) / 1e9 < STOPS_S + SLACK_S
+    assert (drive.stands().stamp_ns - since_ns) / 1e9 < STOPS_S + SLACK_S
 
 
 @contextmanager
@@ -116,7 +114,7 @@ def held(folder, there=True):
     try:
         drive.drive()
         wait_for(lambda: drive.guard.pauses)
-        wait_for(lambda: words(drive.log)[-1].throttle == 0)
+        drive.stands()
         time.sleep(0.3)  # both guards know of each other's stop by then
         yield drive
     finally:
@@ -132,7 +130,7 @@ def test_where_the_file_allows_it_the_vehicle_drives_on_again_and_again(tmp_path
             assert not drive.guard.tripped, drive.guard.reason
             assert len(drive.driven()) > count + 10
             wait_for(lambda: drive.guard.pauses)
-            wait_for(lambda: words(drive.log)[-1].throttle == 0)
+            drive.stands()
             time.sleep(0.3)
 
 
@@ -182,7 +180,7 @@ def test_a_command_that_comes_after_its_time_is_not_obeyed(drive):
         drive.vehicle.write(0.0, 0.2)
     time.sleep(0.4)
     os.kill(drive.vehicle.pid, signal.SIGCONT)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    drive.stands()
     time.sleep(0.1)
     assert len(drive.driven()) == count
 
@@ -201,8 +199,7 @@ def test_its_death_stops_the_drive_is_named_and_another_one_stops_the_vehicle(dr
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: drive.guard.tripped)
     assert drive.guard.reason == "the guard's process was ended by signal 9"
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid not in (pid, os.getpid())
+    assert drive.stands().pid not in (pid, os.getpid())
     drive.guard.close()
     assert drive.vehicle.unheard is None
 
@@ -212,7 +209,7 @@ def test_told_to_end_it_stops_the_vehicle_and_says_so(drive):
     os.kill(drive.vehicle.pid, signal.SIGTERM)
     wait_for(lambda: drive.guard.tripped)
     assert "SIGTERM" in drive.guard.reason
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    drive.stands()
 
 
 def test_what_a_terminal_sends_is_not_for_it(drive):
@@ -231,8 +228,7 @@ def test_a_bus_that_is_out_for_long_hears_the_stop_when_it_is_back(tmp_path):
     time.sleep(1.0)
     assert words(drive.log)[-1].throttle == 0.2  # the last that it has heard
     deaf.unlink()
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid == drive.vehicle.pid  # it answered, and was left alone
+    assert drive.stands().pid == drive.vehicle.pid  # it answered, and was left alone
     drive.guard.close()
     assert (drive.vehicle.unheard, drive.vehicle.replaced) == (None, None)
 
@@ -271,10 +267,9 @@ def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, endin
     drive = hung(tmp_path, how)
     pid, due_ns = drive.vehicle.pid, time.monotonic_ns()
     ENDINGS[ending](drive)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
     # A `stop` that does not return is waited for, after the last command's time is over.
     within_s = REPLACED_S + (0.6 if how == "locked" else 0.0)
-    assert (drive.stood_ns() - due_ns) / 1e9 < within_s
+    assert (drive.stands().stamp_ns - due_ns) / 1e9 < within_s
     assert words(drive.log)[-1].pid not in (pid, os.getpid())
     drive.guard.close()
     assert (time.monotonic_ns() - due_ns) / 1e9 < within_s + SLACK_S
@@ -286,8 +281,7 @@ def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, endin
 def test_nobody_needs_to_ask_for_a_reading_for_a_hang_to_be_noticed(tmp_path):
     drive = hung(tmp_path, timeout_s=0.2)  # the loop asks no more: its own guard stops the vehicle
     assert drive.guard.wait(2.0)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid != drive.vehicle.pid
+    assert drive.stands().pid != drive.vehicle.pid
     drive.guard.close()
 
 
@@ -323,7 +317,7 @@ def test_what_no_process_could_stop_is_said(tmp_path, monkeypatch):
     assert "no answer" in drive.vehicle.unheard
     assert drive.vehicle.unheard.endswith("OSError: the bus is out")
     deaf.unlink()
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)  # whoever was started says it until then
+    drive.stands()  # whoever was started says it until then
 
 
 def test_a_vehicle_that_does_not_hear_its_guard_is_left_to_it_in_the_end(tmp_path, monkeypatch):
@@ -338,8 +332,7 @@ def test_a_vehicle_that_does_not_hear_its_guard_is_left_to_it_in_the_end(tmp_pat
     )
     assert drive.guarding.process.poll() is None
     deaf.unlink()
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid == drive.vehicle.pid
+    assert drive.stands().pid == drive.vehicle.pid
     assert drive.guarding.process.wait(10) == 0
 
 
@@ -352,8 +345,7 @@ def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):
     with pytest.raises(OSError, match="no reading"):
         drive.vehicle.read()
     drive.drive(0.5)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert (drive.stood_ns() - since_ns) / 1e9 < STOPS_S + SLACK_S
+    assert (drive.stands().stamp_ns - since_ns) / 1e9 < STOPS_S + SLACK_S
     drive.guard.close()
 
 
