@@ -172,7 +172,7 @@ def test_check_is_content_with_a_right_map_and_names_the_marker_that_was_entered
 def test_sizes_ten_times_too_large_are_refused(drive, tmp_path, capsys, room):
     """Of one marker, and of all."""
     markers = rig_rooms.as_map(room)
-    size_m = np.asarray(markers.size_m) * np.where(np.arange(8) == 5, 10, 1)
+    size_m = markers.size_m * np.where(np.arange(8) == 5, 10.0, 1.0)
     save_markers(tmp_path / "five.yaml", dataclasses.replace(markers, size_m=size_m))
     save_markers(tmp_path / "all.yaml", rig_rooms.as_map(room[:1], size_m=1.72))
     for command, file, more, line in (
