@@ -352,7 +352,9 @@ def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("jaxnav.vehicles.sim:open_vehicle", "it shares its process"),
+        pytest.param(
+            "jaxnav.vehicles.sim:open_vehicle", "it shares its process", marks=pytest.mark.long
+        ),
         ("tests.helpers.plain_car:open_curious_vehicle", "it looks at setup.rig"),
         pytest.param("tests.worlds:qcar", "its module imports jax", marks=pytest.mark.long),
         ("tests.helpers.plain_car:nothing", "there --car: tests.helpers.plain_car:nothing: "),

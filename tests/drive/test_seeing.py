@@ -178,13 +178,13 @@ def test_a_warm_search_compiles_nothing_whatever_there_is_to_see(data_dir):
     )
     search.warm_up()
     found = 0
-    for path in sorted((data_dir / "apriltag_photos").glob("*.jpg"))[:8]:
+    for path in sorted((data_dir / "apriltag_photos").glob("*.jpg"))[:3]:
         photo = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         for scale in (1.0, 1.6):
             image = cv2.resize(photo, (round(width * scale), round(width * scale * 2 / 3)))
             image = np.ascontiguousarray(image[:height, :width])
             found += len(search.look(Frame(0, image), None).detections)
-    assert found > 10
+    assert found > 5
     image, truth = other_pictures("blur4")[0]
     image = cv2.copyMakeBorder(
         image, 0, height - len(image), 0, width - image.shape[1], cv2.BORDER_REPLICATE

@@ -34,10 +34,10 @@ def rendered(tmp_path_factory):
 
 
 def write_camera(path, intrinsics, size_px):
-    """A Kalibr camchain of a pinhole camera."""
+    """A Kalibr camchain of the kind of lens that the QCar has, whose programs are there."""
     path.write_text(
-        f"cam0: {{camera_model: pinhole, intrinsics: {intrinsics}, distortion_model: none,"
-        f" distortion_coeffs: [], resolution: {size_px}}}\n"
+        f"cam0: {{camera_model: pinhole, intrinsics: {intrinsics}, distortion_model: equidistant,"
+        f" distortion_coeffs: [0, 0, 0, 0], resolution: {size_px}}}\n"
     )
 
 
