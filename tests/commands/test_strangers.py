@@ -86,7 +86,7 @@ def drawn(path: Path) -> bool:
     return image is not None and min(image.shape[:2]) > 300 and len(np.unique(image)) > 20
 
 
-def test_it_arrives_where_it_thinks(stranger, driven):
+def test_it_arrives_by_its_images(stranger, driven):
     log = read_drive(driven.path)
     assert log.header["vehicle"]["base"] in ("differential", "omni")
     assert np.hypot(*(np.array(driven.told[-1].pose[:2]) - stranger.goal_m)) < 0.15
