@@ -86,7 +86,7 @@ def drawn(path: Path) -> bool:
     return image is not None and min(image.shape[:2]) > 300 and len(np.unique(image)) > 20
 
 
-def test_it_arrives_by_its_images(stranger, driven):
+def test_it_arrives_where_it_thinks(stranger, driven):
     log = read_drive(driven.path)
     assert log.header["vehicle"]["base"] in ("differential", "omni")
     assert np.hypot(*(np.array(driven.told[-1].pose[:2]) - stranger.goal_m)) < 0.15
@@ -106,6 +106,10 @@ def test_it_arrives_by_its_images(stranger, driven):
     assert np.abs(twist[:, 1]).max() > 0.1 if len(stranger.cameras) > 1 else not twist[:, 1].any()
     readings = sum(len(given.gyro) for given in log.inputs)
     assert readings > 50 if len(stranger.cameras) > 1 else readings == 0
+
+
+def test_it_arrives_by_its_images(stranger, driven):
+    log = read_drive(driven.path)
     seen = [one.detections for given in log.inputs for one in given.frames if one.detections]
     assert {name for one in seen for name in one.families} == {stranger.family}
     shown = {image.topic for image in log.images()}
