@@ -48,7 +48,7 @@ KINDS = [
     ("tag25h9", "thin_prism", 5, 4, LARGE, "apriltag", False),
     ("4x4_50", "rational", 1, 2, USUAL, "aruco", False),
     ("tag16h5", "equidistant", 1, 1, USUAL, "apriltag", False),
-    # Those of `follow` take long to compile: in `make test` they are those of the last test.
+    # Those of `follow` take long to compile: `make test` has them in test_track of the detection.
     ("tag16h5", "radtan", 2, 1, LARGE, "aruco", True),
     ("tag36h11", "omni", 1, 4, USUAL, "apriltag", True),
 ]
@@ -168,6 +168,7 @@ def test_so_of_every_family(family):
     searches[0].look(Frame(1, cv2.GaussianBlur(image, (0, 0), 4.0)), None)
 
 
+@pytest.mark.long
 def test_a_warm_search_compiles_nothing_whatever_there_is_to_see(data_dir):
     """Of photographs, and of pictures by another renderer."""
     late.forget()
