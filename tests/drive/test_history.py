@@ -62,17 +62,6 @@ def test_what_is_believed_is_that_of_the_sorted_events(late_ns):
     assert len(accepted) == len(late_ns) or max(late_ns) > 0
 
 
-def test_a_late_event_undoes_those_after_it_alone():
-    history = History((), BEGIN_NS)
-    for number in range(10):
-        fuse(history, BEGIN_NS + 10 * MS * number, number)
-    placed = history.place(BEGIN_NS + 65 * MS, told(99))
-    assert placed is not None
-    base, entries = placed
-    assert base.stamp_ns == BEGIN_NS + 60 * MS
-    assert [number_of(entry.data) for entry in entries] == [99, 7, 8, 9]
-
-
 def test_cameras_that_are_always_late_cost_little():
     """30 Hz, each frame 100 ms old, among odometry at 50 Hz: nothing is ever refused."""
     history = History((), -1)
