@@ -329,7 +329,7 @@ def test_a_camera_or_a_vehicle_that_can_not_be_read_now_is_no_reason_to_stop(sta
 
 
 def test_it_ends_in_good_order_when_its_time_or_what_the_vehicle_drives_is_over(standing):
-    with Drive(standing, lasts_s=0.8) as drive:
+    with Drive(standing, lasts_s=2.0) as drive:
         drive.thread.join(5)
         assert (drive.ended, drive.loop.stopped) == ("time is over", False)
         assert drive.loop.statistics.quantile_ms("handle odometry", 0.5) < 100
