@@ -18,58 +18,40 @@ import yaml
 from jaxnav.cli import EXIT_BAD_INPUT, main
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.files import load_markers, load_rig, load_route
-from jaxnav.recordings.drive_log import DriveLog, read_drive
+from jaxnav.recordings.drive_log import read_drive
 from jaxnav.sim.rendering import Renderer
 from jaxnav.sim.scene import Scene
 from tests.helpers import recorded_vehicle
 from tests.helpers.recorded_vehicle import Word, words
-from tests.helpers.strangers import Stranger, jaxnav
+from tests.helpers.strangers import jaxnav
+
+# What our car's tests show in `make test` as well.
+SLIDER = [pytest.param("slider", marks=pytest.mark.long)]
 
 
 @dataclass(frozen=True)
 class Driven:
-    """A recorded drive, what it printed, and what the vehicle was told where."""
+    """A recorded drive, and what the vehicle was told where."""
 
     path: Path
-    out: str
     told: list[Word]
-
-    def off(self, log: DriveLog) -> tuple[np.ndarray, np.ndarray]:
-        """How far each decided pose is from the true one, m and rad.
-
-        Of health nothing is asked: a busy machine makes frames and readings stale.
-        """
-        stamps_ns, true = np.array([w.clock_ns for w in self.told]), [w.pose for w in self.told]
-        known = log.outcomes.located & log.outcomes.decided
-        pose, at_ns = log.outcomes.pose[known], log.outcomes.now_ns[known]
-        there = np.array(true)
-        x_m, y_m, psi_rad = (np.interp(at_ns, stamps_ns, column) for column in there.T)
-        turn_rad = np.angle(np.exp(1j * (pose[:, 2] - psi_rad)))
-        return np.hypot(pose[:, 0] - x_m, pose[:, 1] - y_m), np.abs(turn_rad)
-
-
-def drive(stranger: Stranger, name: str, *arguments: object) -> Driven:
-    """One that arrives, with a watchdog that is patient with a busy machine."""
-    path, told = stranger.folder / f"{name}.mcap", stranger.folder / f"{name}.told"
-    ended = jaxnav(
-        stranger.folder, "run", *stranger.flags(), "--car", recorded_vehicle.NAME,
-        "--cameras", "sim", "--option", f"log={told}", "--record", path, "--timeout-s", 3,
-        "--duration-s", 90, "--headless", *arguments,
-    )  # fmt: skip
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout.startswith("ended: arrived\n")
-    return Driven(path, ended.stdout, words(told))
 
 
 @pytest.fixture(scope="module")
 def driven(stranger) -> Driven:
-    return drive(stranger, "a drive")
-
-
-@pytest.fixture(scope="module")
-def pictured(stranger) -> Driven:
-    """By rendered images, which are recorded."""
-    return drive(stranger, "a film", "--option", "images=true", "--record-images")
+    """By rendered images, which are recorded, with a watchdog that is patient with a busy
+    machine. What follows blurred markers takes long to compile: it is the slider's."""
+    path, told = stranger.folder / "a drive.mcap", stranger.folder / "a drive.told"
+    detector = "decode-only" if len(stranger.cameras) == 1 else "follow"
+    ended = jaxnav(
+        stranger.folder, "run", *stranger.flags(), "--car", recorded_vehicle.NAME,
+        "--cameras", "sim", "--option", f"log={told}", "--option", "images=true",
+        "--option", "rate_hz=12", "--detector", detector,
+        "--record", path, "--record-images", "--timeout-s", 3, "--duration-s", 90, "--headless",
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("ended: arrived\n")
+    return Driven(path, words(told))
 
 
 @pytest.fixture(scope="module")
@@ -108,12 +90,16 @@ def test_it_arrives_where_it_thinks(stranger, driven):
     log = read_drive(driven.path)
     assert log.header["vehicle"]["base"] in ("differential", "omni")
     assert np.hypot(*(np.array(driven.told[-1].pose[:2]) - stranger.goal_m)) < 0.15
-    off_m, off_rad = driven.off(log)
-    half = len(off_m) // 2
-    assert half > 20
-    assert np.median(off_m[half:]) < 0.03
+    # Of health nothing is asked: a busy machine makes frames and readings stale.
+    known = log.outcomes.located & log.outcomes.decided
+    clock_ns, true = [w.clock_ns for w in driven.told], np.array([w.pose for w in driven.told])
+    there = [np.interp(log.outcomes.now_ns[known], clock_ns, column) for column in true.T]
+    off = (log.outcomes.pose[known] - np.stack(there, axis=1))[known.sum() // 2 :]
+    off_m, off_rad = np.hypot(*off.T[:2]), np.abs(np.angle(np.exp(1j * off[:, 2])))
+    assert len(off) > 20
+    assert np.median(off_m) < 0.05
     assert off_m[-1] < 0.05
-    assert np.rad2deg(np.median(off_rad[half:])) < 2
+    assert np.rad2deg(np.median(off_rad)) < 3
     assert driven.told[-1].throttle == 0
     twist = log.outcomes.twist
     assert twist[-1].tolist() == [0.0, 0.0, 0.0]
@@ -122,12 +108,8 @@ def test_it_arrives_where_it_thinks(stranger, driven):
     assert readings > 50 if len(stranger.cameras) > 1 else readings == 0
 
 
-def test_it_arrives_by_its_images(stranger, pictured):
-    log = read_drive(pictured.path)
-    off_m, off_rad = pictured.off(log)
-    half = len(off_m) // 2
-    assert np.median(off_m[half:]) < 0.05
-    assert np.rad2deg(np.median(off_rad[half:])) < 3
+def test_it_arrives_by_its_images(stranger, driven):
+    log = read_drive(driven.path)
     seen = [one.detections for given in log.inputs for one in given.frames if one.detections]
     assert {name for one in seen for name in one.families} == {stranger.family}
     shown = {image.topic for image in log.images()}
@@ -142,20 +124,19 @@ def test_its_drive_replays_to_the_same_bits(stranger, driven, tmp_path):
     assert summary["compared"] > 50
 
 
-def test_its_images_are_searched_once_more(stranger, pictured, tmp_path):
-    ended = jaxnav(
-        stranger.folder, "replay", pictured.path, "--images", "--limit", 200, "--out", tmp_path,
-        "--headless",
-    )  # fmt: skip
+@pytest.mark.parametrize("stranger", SLIDER, indirect=True)
+def test_its_images_are_searched_once_more(stranger, driven, tmp_path):
+    words = ("--images", "--limit", 200, "--out", tmp_path, "--headless")
+    ended = jaxnav(stranger.folder, "replay", driven.path, *words)
     assert (ended.returncode, ended.stderr) == (0, "")
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["decided_share"] > 0.2
+    assert json.loads((tmp_path / "summary.json").read_text())["decided_share"] > 0.2
 
 
+@pytest.mark.parametrize("stranger", SLIDER, indirect=True)
 def test_its_drive_is_driven_again(stranger, driven):
     ended = jaxnav(
         stranger.folder, "run", "--car", "replay", "--option", f"drive={driven.path}",
-        "--timeout-s", 3, "--headless",
+        "--timeout-s", 3, "--detector", "decode-only", "--headless",
     )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (0, "")
 
@@ -167,9 +148,9 @@ def test_its_drive_is_drawn(driven, here, tmp_path):
     assert drawn(tmp_path / "drive.png")
 
 
-def test_its_drive_is_shown(pictured, here, tmp_path):
+def test_its_drive_is_shown(driven, here, tmp_path):
     pytest.importorskip("rerun")
-    code, _, err = here("view", pictured.path, "--out", tmp_path / "a view.rrd", "--headless")
+    code, _, err = here("view", driven.path, "--out", tmp_path / "a view.rrd", "--headless")
     assert (code, err) == (0, "")
     assert (tmp_path / "a view.rrd").stat().st_size > 50_000
 
@@ -177,13 +158,14 @@ def test_its_drive_is_shown(pictured, here, tmp_path):
 def test_the_doctor_finds_it_well(stranger, pictures, here, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxnav.commands.doctor.computer.clock", list)
     monkeypatch.setattr("jaxnav.commands.doctor.computer.disk", lambda folder: [])
-    frames = [f"--frame={name}={path}" for name, path in pictures.items()]
+    shown = pictures if len(stranger.cameras) > 1 else {}  # whose search takes long to compile
+    frames = [f"--frame={name}={path}" for name, path in shown.items()]
     code, out, _ = here("doctor", *stranger.flags(), *frames, "--json", tmp_path / "found.json")
     assert code == 0, out
     found = json.loads((tmp_path / "found.json").read_text())["findings"]
     bad = [one for one in found if one["level"] in ("error", "warning")]
     assert not bad
-    assert any("the car stands at x 10.0" in one["what"] for one in found)
+    assert any("the car stands at x 10.0" in one["what"] for one in found) == bool(shown)
 
 
 def test_a_photograph_of_its_marker_tells_where_it_is(stranger, pictures, here, tmp_path):

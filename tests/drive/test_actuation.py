@@ -198,12 +198,6 @@ def test_a_car_as_its_file_says_within_a_factor_is_believed(told, gain, slower):
     assert not any(car.drive(throttle, seconds) for throttle, seconds in told)
 
 
-def test_brakes_may_act_at_once():
-    car = Throttled()
-    car.drive(0.04, 2.0)
-    assert not car.drive(0.0, 3.0, lie=lambda v: 0.0)
-
-
 @pytest.mark.parametrize("by", [0.0, 0.3, 3.0, -1.0])
 def test_what_the_throttle_contradicts_is_doubted_until_corners_confirm(by):
     car = Throttled()
@@ -215,13 +209,7 @@ def test_what_the_throttle_contradicts_is_doubted_until_corners_confirm(by):
     assert car.propulsion.off_m == pytest.approx(off_m, abs=0.02)
     car.propulsion.confirm()
     assert not car.drive(0.04, 2.0)
-
-
-def test_how_far_off_it_may_be_is_the_way_between_the_two():
-    car = Throttled()
-    car.drive(0.04, 2.0)
-    car.drive(0.04, 2.0, lie=lambda v: 0.0)
-    assert car.propulsion.off_m == pytest.approx(0.8, rel=0.05)
+    assert not car.drive(0.0, 3.0, lie=lambda v: 0.0)  # brakes may act at once
 
 
 def test_a_throttle_that_moves_nothing_while_corners_agree_says_nothing():

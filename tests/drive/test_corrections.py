@@ -2,7 +2,6 @@
 to the servo; a vehicle without calibration changes no bit."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,10 +16,6 @@ from jaxnav.drive.guard import Guard
 from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.limits import Limits
 from jaxnav.drive.pilot import Input
-from jaxnav.errors import BadInput
-from jaxnav.files import load_vehicle, save_vehicle
-from jaxnav.files.provenance import calibrated_now
-from jaxnav.recordings.drive_setup import DriveSetup
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS
 from jaxnav.vehicles.sim import SimVehicle
 from jaxnav.vehicles.world import SimWorld
@@ -34,7 +29,6 @@ CORRECTIONS = {
     "steering_offset_rad": 0.02,
     "camera_delay_s": 0.035,
 }
-HERE = Path("drive.mcap")
 
 
 def vehicle(**changes: float):
@@ -143,38 +137,3 @@ def test_the_simulated_car_is_off_as_its_file_says():
     assert read.steering_rad == pytest.approx((0.2 - 0.02) / 0.93)
     car.write((0.2 - 0.02) / 0.93, 0.1)
     assert told[-1][:2] == (pytest.approx(0.2), 0.1)
-
-
-def test_files_hold_every_figure(tmp_path):
-    path = tmp_path / "vehicle.yaml"
-    before = vehicle()
-    calibrated = calibrated_now("jaxnav test", [np.arange(3)])
-    save_vehicle(path, before, calibrated, {"speed_scale": 0.001, "wheelbase_m": 0.0003})
-    after = load_vehicle(path)
-    for field in dataclasses.fields(before):
-        if field.name not in ("sensor_sigma", "gyro"):
-            assert float(getattr(after, field.name)) == float(getattr(before, field.name))
-    text = path.read_text()
-    assert text.startswith("calibrated:")
-    assert "speed_scale: 1.06" in text
-    save_vehicle(path, worlds.qcar())
-    assert "\ncamera_delay_s" not in path.read_text()
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("speed_scale", 0.0), ("steering_gain", 20.0), ("camera_delay_s", 2.0)]
-)
-def test_impossible_figures_are_named(tmp_path, key, value):
-    path = tmp_path / "vehicle.yaml"
-    save_vehicle(path, dataclasses.replace(worlds.qcar(), **{key: value}))
-    with pytest.raises(BadInput, match=f"{key}: must be"):
-        load_vehicle(path)
-
-
-def test_a_recorded_drive_keeps_the_calibration_and_an_old_one_has_none():
-    setup = make_setup()
-    assert "speed_scale" not in setup.header()["vehicle"]
-    header = dataclasses.replace(setup, vehicle=vehicle()).header()
-    assert header["vehicle"]["camera_delay_s"] == 0.035
-    read = DriveSetup.from_header(header, HERE).vehicle
-    assert Corrections.of(read) == Corrections.of(vehicle())

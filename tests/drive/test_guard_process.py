@@ -1,13 +1,12 @@
 """The guard's process: whatever happens to the computing process, the vehicle stops, and soon."""
 
+import itertools
 import os
 import resource
 import signal
 import subprocess
-import sys
 import time
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
@@ -18,19 +17,24 @@ from jaxnav.errors import BadInput
 from tests.helpers import plain_car
 from tests.helpers.dying_parent import ENDS, LIMITS, make_setup
 from tests.helpers.plain_car import wait_for, words
+from tests.helpers.processes import ROOT, python
 
-ROOT = Path(__file__).resolve().parents[2]
 STOPS_S = 0.2
 REPLACED_S = 2.0
 SLACK_S = 0.3  # of a machine that does something else; measured without it by bench_stop.py
 
 
-@contextmanager
-def closing_of(guarding):
-    try:
-        yield guarding
-    finally:
-        guarding.end()
+@pytest.fixture
+def guarding_of():
+    """Processes of guards that are ended in the end."""
+    with ExitStack() as closing:
+
+        def made(name):
+            guarding = GuardProcess(name)
+            closing.callback(guarding.end)
+            return guarding
+
+        yield made
 
 
 class Drive:
@@ -59,12 +63,11 @@ class Drive:
     def driven(self):
         return [word for word in words(self.log) if word.throttle]
 
-    def stood_ns(self):
-        """Since when it was told nothing but zero."""
+    def stands(self):
+        """Wait until the last word is a stop; the first one of those that nothing came after."""
+        wait_for(lambda: words(self.log)[-1].throttle == 0)
         told = words(self.log)
-        last = max(index for index, word in enumerate(told) if word.throttle)
-        assert len(told) > last + 1, "the last word was a throttle"
-        return told[last + 1].stamp_ns
+        return told[max(index for index, word in enumerate(told) if word.throttle) + 1]
 
 
 @pytest.fixture
@@ -74,18 +77,16 @@ def drive(tmp_path):
     drive.guard.close()
 
 
-@pytest.mark.parametrize("how", ENDS)
+OFTEN = {"kill -9", "SIGSTOP", "no memory", "held lock"}
+
+
+@pytest.mark.parametrize(
+    "how", [pytest.param(how, marks=() if how in OFTEN else pytest.mark.long) for how in ENDS]
+)
 def test_however_the_process_that_computes_ends_the_vehicle_stands(tmp_path, how):
     log = tmp_path / "log"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.helpers.dying_parent", str(log), how, "0.1"],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    with process:
+    command = ("-m", "tests.helpers.dying_parent", log, how, 0.1)
+    with python(*command, cwd=ROOT, stderr=subprocess.DEVNULL) as process:
         try:
             ended_ns = int(process.stdout.readline())
             wait_for(lambda: words(log)[-1].throttle == 0, 5.0)
@@ -103,8 +104,7 @@ def test_commands_that_stop_coming_stop_it(drive):
     since_ns = drive.driven()[-1].stamp_ns
     wait_for(lambda: drive.guard.tripped)
     assert "no fresh command" in drive.guard.reason
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert (drive.stood_ns() - since_ns) / 1e9 < STOPS_S + SLACK_S
+    assert (drive.stands().stamp_ns - since_ns) / 1e9 < STOPS_S + SLACK_S
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def held(folder, there=True):
     try:
         drive.drive()
         wait_for(lambda: drive.guard.pauses)
-        wait_for(lambda: words(drive.log)[-1].throttle == 0)
+        drive.stands()
         time.sleep(0.3)  # both guards know of each other's stop by then
         yield drive
     finally:
@@ -130,7 +130,7 @@ def test_where_the_file_allows_it_the_vehicle_drives_on_again_and_again(tmp_path
             assert not drive.guard.tripped, drive.guard.reason
             assert len(drive.driven()) > count + 10
             wait_for(lambda: drive.guard.pauses)
-            wait_for(lambda: words(drive.log)[-1].throttle == 0)
+            drive.stands()
             time.sleep(0.3)
 
 
@@ -180,7 +180,7 @@ def test_a_command_that_comes_after_its_time_is_not_obeyed(drive):
         drive.vehicle.write(0.0, 0.2)
     time.sleep(0.4)
     os.kill(drive.vehicle.pid, signal.SIGCONT)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    drive.stands()
     time.sleep(0.1)
     assert len(drive.driven()) == count
 
@@ -199,8 +199,7 @@ def test_its_death_stops_the_drive_is_named_and_another_one_stops_the_vehicle(dr
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: drive.guard.tripped)
     assert drive.guard.reason == "the guard's process was ended by signal 9"
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid not in (pid, os.getpid())
+    assert drive.stands().pid not in (pid, os.getpid())
     drive.guard.close()
     assert drive.vehicle.unheard is None
 
@@ -210,12 +209,12 @@ def test_told_to_end_it_stops_the_vehicle_and_says_so(drive):
     os.kill(drive.vehicle.pid, signal.SIGTERM)
     wait_for(lambda: drive.guard.tripped)
     assert "SIGTERM" in drive.guard.reason
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
+    drive.stands()
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGHUP", "SIGQUIT", "SIGTSTP"])
-def test_what_a_terminal_sends_is_not_for_it(drive, number):
-    os.kill(drive.vehicle.pid, getattr(signal, number))
+def test_what_a_terminal_sends_is_not_for_it(drive):
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP):
+        os.kill(drive.vehicle.pid, number)
     drive.drive(0.3)
     assert not drive.guard.tripped
 
@@ -229,19 +228,21 @@ def test_a_bus_that_is_out_for_long_hears_the_stop_when_it_is_back(tmp_path):
     time.sleep(1.0)
     assert words(drive.log)[-1].throttle == 0.2  # the last that it has heard
     deaf.unlink()
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid == drive.vehicle.pid  # it answered, and was left alone
+    assert drive.stands().pid == drive.vehicle.pid  # it answered, and was left alone
     drive.guard.close()
     assert (drive.vehicle.unheard, drive.vehicle.replaced) == (None, None)
 
 
-def hang(drive, how):
-    """Let the car hang in its next word; returns when the guard's process is silent."""
+def hung(folder, how="stopped", timeout_s=0.6, **options):
+    """A drive whose car hangs in its last word, and with it the guard's process."""
+    drive = Drive(folder, timeout_s=timeout_s, hangs=folder / "hangs", **options)
+    drive.drive()
     (drive.log.parent / "hangs").write_text(how)
     drive.drive(0.15)  # the last ones are not obeyed any more
     assert drive.driven()
     assert words(drive.log)[-1].throttle
     (drive.log.parent / "hangs").unlink()
+    return drive
 
 
 ENDINGS = {
@@ -251,18 +252,24 @@ ENDINGS = {
 }
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("how", plain_car.HANGS)
+# Each hang and each ending once; in `make test-all` all together.
+TOGETHER = list(zip(plain_car.HANGS, ENDINGS, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("how", "ending"),
+    [
+        pytest.param(*both, marks=() if both in TOGETHER else pytest.mark.long)
+        for both in itertools.product(plain_car.HANGS, ENDINGS)
+    ],
+)
 def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, ending):
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, how)
+    drive = hung(tmp_path, how)
     pid, due_ns = drive.vehicle.pid, time.monotonic_ns()
     ENDINGS[ending](drive)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
     # A `stop` that does not return is waited for, after the last command's time is over.
     within_s = REPLACED_S + (0.6 if how == "locked" else 0.0)
-    assert (drive.stood_ns() - due_ns) / 1e9 < within_s
+    assert (drive.stands().stamp_ns - due_ns) / 1e9 < within_s
     assert words(drive.log)[-1].pid not in (pid, os.getpid())
     drive.guard.close()
     assert (time.monotonic_ns() - due_ns) / 1e9 < within_s + SLACK_S
@@ -272,19 +279,14 @@ def test_a_guard_that_gives_no_answer_to_a_stop_is_replaced(tmp_path, how, endin
 
 
 def test_nobody_needs_to_ask_for_a_reading_for_a_hang_to_be_noticed(tmp_path):
-    drive = Drive(tmp_path, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, "stopped")  # the loop asks no more: its own guard stops the vehicle
+    drive = hung(tmp_path, timeout_s=0.2)  # the loop asks no more: its own guard stops the vehicle
     assert drive.guard.wait(2.0)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid != drive.vehicle.pid
+    assert drive.stands().pid != drive.vehicle.pid
     drive.guard.close()
 
 
 def test_where_nothing_can_be_opened_or_started_any_more_it_is_replaced_too(tmp_path):
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, "stopped")
+    drive = hung(tmp_path)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))
     try:
@@ -297,9 +299,7 @@ def test_where_nothing_can_be_opened_or_started_any_more_it_is_replaced_too(tmp_
 
 
 def test_where_the_spare_hangs_as_well_another_one_is_started(tmp_path):
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs")
-    drive.drive()
-    hang(drive, "stopped")
+    drive = hung(tmp_path)
     os.kill(drive.guarding.spare_pid, signal.SIGSTOP)
     drive.guard.close()
     assert words(drive.log)[-1].throttle == 0
@@ -310,16 +310,14 @@ def test_where_the_spare_hangs_as_well_another_one_is_started(tmp_path):
 def test_what_no_process_could_stop_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(moved_vehicle, "_CLOSES_S", 1.0)
     deaf = tmp_path / "deaf"
-    drive = Drive(tmp_path, timeout_s=0.6, hangs=tmp_path / "hangs", deaf=deaf)
-    drive.drive()
-    hang(drive, "stopped")
+    drive = hung(tmp_path, deaf=deaf)
     deaf.touch()
     drive.guard.close(heard_within_s=1.0)
     assert drive.vehicle.replaced is None
     assert "no answer" in drive.vehicle.unheard
     assert drive.vehicle.unheard.endswith("OSError: the bus is out")
     deaf.unlink()
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)  # whoever was started says it until then
+    drive.stands()  # whoever was started says it until then
 
 
 def test_a_vehicle_that_does_not_hear_its_guard_is_left_to_it_in_the_end(tmp_path, monkeypatch):
@@ -334,8 +332,7 @@ def test_a_vehicle_that_does_not_hear_its_guard_is_left_to_it_in_the_end(tmp_pat
     )
     assert drive.guarding.process.poll() is None
     deaf.unlink()
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert words(drive.log)[-1].pid == drive.vehicle.pid
+    assert drive.stands().pid == drive.vehicle.pid
     assert drive.guarding.process.wait(10) == 0
 
 
@@ -348,50 +345,47 @@ def test_a_driver_that_hangs_there_is_stopped_around(tmp_path):
     with pytest.raises(OSError, match="no reading"):
         drive.vehicle.read()
     drive.drive(0.5)
-    wait_for(lambda: words(drive.log)[-1].throttle == 0)
-    assert (drive.stood_ns() - since_ns) / 1e9 < STOPS_S + SLACK_S
+    assert (drive.stands().stamp_ns - since_ns) / 1e9 < STOPS_S + SLACK_S
     drive.guard.close()
 
 
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("jaxnav.vehicles.sim:open_vehicle", "it shares its process"),
+        pytest.param(
+            "jaxnav.vehicles.sim:open_vehicle", "it shares its process", marks=pytest.mark.long
+        ),
         ("tests.helpers.plain_car:open_curious_vehicle", "it looks at setup.rig"),
-        ("tests.worlds:qcar", "its module imports jax"),
+        pytest.param("tests.worlds:qcar", "its module imports jax", marks=pytest.mark.long),
         ("tests.helpers.plain_car:nothing", "there --car: tests.helpers.plain_car:nothing: "),
     ],
 )
-def test_a_vehicle_that_can_not_be_moved_says_why(tmp_path, name, why):
-    with closing_of(GuardProcess(name)) as guarding:
-        guarding.prepare(lambda: None)
-        assert guarding.open(make_setup(log=tmp_path / "log"), LIMITS, 0.2) is None
-        assert guarding.stays.startswith(why)
-        assert guarding.process.wait(5) == 0
+def test_a_vehicle_that_can_not_be_moved_says_why(tmp_path, guarding_of, name, why):
+    guarding = guarding_of(name)
+    guarding.prepare(lambda: None)
+    assert guarding.open(make_setup(log=tmp_path / "log"), LIMITS, 0.2) is None
+    assert guarding.stays.startswith(why)
+    assert guarding.process.wait(5) == 0
 
 
-def test_a_vehicle_that_does_not_open_is_bad_input(tmp_path):
-    with closing_of(GuardProcess(plain_car.NAME)) as guarding:
-        guarding.prepare(lambda: None)
-        with pytest.raises(BadInput, match="could not be opened: "):
-            guarding.open(make_setup(log=tmp_path / "nowhere" / "log"), LIMITS, 0.2)
+def test_a_vehicle_that_does_not_open_is_bad_input(tmp_path, guarding_of):
+    guarding = guarding_of(plain_car.NAME)
+    guarding.prepare(lambda: None)
+    with pytest.raises(BadInput, match="could not be opened: "):
+        guarding.open(make_setup(log=tmp_path / "nowhere" / "log"), LIMITS, 0.2)
 
 
-def test_a_wait_for_it_can_be_called_off():
+def test_a_wait_for_it_can_be_called_off(guarding_of):
     def called_off():
         raise KeyboardInterrupt
 
-    with closing_of(GuardProcess(plain_car.NAME)) as guarding, pytest.raises(KeyboardInterrupt):
-        guarding.prepare(called_off)
+    with pytest.raises(KeyboardInterrupt):
+        guarding_of(plain_car.NAME).prepare(called_off)
 
 
-@pytest.mark.parametrize("module", ["qcar", "ros2"])
-def test_plug_ins_of_hardware_need_neither_jax_nor_opencv(module):
+def test_plug_ins_of_hardware_need_neither_jax_nor_opencv():
     source = (
-        f"import sys, jaxnav.vehicles.{module}, jaxnav.drive.guard_process\n"
+        "import sys, jaxnav.vehicles.qcar, jaxnav.vehicles.ros2, jaxnav.drive.guard_process\n"
         "print([name for name in ('jax', 'cv2', 'jaxlib') if name in sys.modules])"
     )
-    told = subprocess.run(
-        [sys.executable, "-c", source], capture_output=True, text=True, check=True
-    )
-    assert told.stdout == "[]\n"
+    assert python("-c", source).communicate()[0] == "[]\n"

@@ -3,10 +3,7 @@
 import math
 import os
 import signal
-import subprocess
-import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -17,8 +14,8 @@ from jaxnav.drive.moved_vehicle import GuardProcess
 from tests.helpers import plain_base
 from tests.helpers.plain_base import PlainBase, make_setup, words
 from tests.helpers.plain_car import wait_for
+from tests.helpers.processes import python
 
-ROOT = Path(__file__).resolve().parents[2]
 LIMITS = TwistLimits(forward_mps=1.0, left_mps=0.5, turn_radps=3.0)
 ZERO = (0.0, 0.0, 0.0)
 DRIVES = """
@@ -64,8 +61,7 @@ def test_before_it_is_armed_it_stands_and_then_it_is_cut_at_its_limits(tmp_path,
     assert guard.tripped
 
 
-@pytest.mark.parametrize("part", range(3))
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize(("part", "value"), [(0, math.nan), (1, math.inf), (2, math.nan)])
 def test_one_part_that_is_no_number_stops_all_for_good(tmp_path, guard, part, value):
     guard.arm()
     guard.write(0.5, 0.0, 2.0)
@@ -80,14 +76,7 @@ def test_one_part_that_is_no_number_stops_all_for_good(tmp_path, guard, part, va
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
 def test_however_the_process_that_computes_ends_the_last_word_is_zero(tmp_path, how):
     log = tmp_path / "log"
-    process = subprocess.Popen(
-        [sys.executable, "-c", DRIVES, str(log)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    with process:
+    with python("-c", DRIVES, log) as process:
         try:
             assert process.stdout.readline() == "drives\n"
             wait_for(lambda: any(word.twist == (0.0, 0.0, 2.0) for word in words(log)))

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxnav.drive.flags import Fault, Health, Reject, names
-from jaxnav.drive.health import LOOKS, MOST_RESTARTS, SPEED_FACTOR, Monitor, Senses, Timeouts
+from jaxnav.drive.flags import Fault, Health
+from jaxnav.drive.health import LOOKS, MOST_RESTARTS, SPEED_FACTOR, Monitor, Senses
 
 WELL = Senses(
     located=True,
@@ -142,14 +142,3 @@ def test_whoever_is_lost_or_blind_stands_still(sensed):
     failed = sensed.faults & (Fault.NOT_FINITE | Fault.VEHICLE_FAILED)
     if not sensed.located or blind or sensed.refused or failed:
         assert SPEED_FACTOR[health] == 0
-
-
-def test_timeouts_can_be_chosen():
-    patient = Monitor(Timeouts(flag_s=10, slow_s=20, stop_s=30, blind_s=40))
-    assert patient.look(dataclasses.replace(WELL, fix_age_s=9.0))[0] == Health.OK
-    assert patient.look(dataclasses.replace(WELL, fix_age_s=31.0))[0] == Health.STOP
-
-
-def test_flags_have_names():
-    assert names(Fault.CAMERA_STALE | Fault.UNSURE) == ["CAMERA_STALE", "UNSURE"]
-    assert names(Reject(0)) == []

@@ -62,40 +62,12 @@ def test_what_is_believed_is_that_of_the_sorted_events(late_ns):
     assert len(accepted) == len(late_ns) or max(late_ns) > 0
 
 
-def test_events_in_order_are_fused_once():
-    history = History((), BEGIN_NS)
-    for number in range(200):
-        placed = history.place(BEGIN_NS + 10 * MS * number, told(number))
-        assert placed is not None
-        base, entries = placed
-        assert [number_of(entry.data) for entry in entries] == [number]
-        history.store((*base.belief, number), entries[0], (*base.belief, number))
-
-
-def test_a_late_event_undoes_those_after_it_alone():
-    history = History((), BEGIN_NS)
-    for number in range(10):
-        fuse(history, BEGIN_NS + 10 * MS * number, number)
-    placed = history.place(BEGIN_NS + 65 * MS, told(99))
-    assert placed is not None
-    base, entries = placed
-    assert base.stamp_ns == BEGIN_NS + 60 * MS
-    assert [number_of(entry.data) for entry in entries] == [99, 7, 8, 9]
-
-
 def test_cameras_that_are_always_late_cost_little():
     """30 Hz, each frame 100 ms old, among odometry at 50 Hz: nothing is ever refused."""
     history = History((), -1)
     events = [(20 * k, 20 * k) for k in range(500)]
     events += [(100 + 33 * k, 33 * k) for k in range(290)]
     assert max(place(history, stamp * MS, told(0)) for _, stamp in sorted(events)) <= 10
-
-
-def test_equal_stamps_keep_their_order():
-    history = History((), BEGIN_NS)
-    assert fuse(history, BEGIN_NS + 5, 1) == (1,)
-    assert fuse(history, BEGIN_NS + 5, 2) == (1, 2)
-    assert fuse(history, BEGIN_NS, 3) == (3, 1, 2)
 
 
 def test_what_is_older_than_all_that_is_kept_is_refused():

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.processes import ROOT, python
+
 PROGRAM = """
 import os, sys, time
 from jaxnav.drive.output import FreeOutput, fill_descriptors
@@ -28,12 +29,7 @@ sys.exit(7)
 
 def run(folder, **how):
     report = folder / "report"
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, str(report)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        **how,
-    )
-    return process, report
+    return python("-c", PROGRAM, report, **how), report
 
 
 def took_s(process, report):

@@ -137,32 +137,26 @@ def test_what_was_contradicted_often_comes_back_when_cameras_agree():
 
 def test_cameras_that_look_in_turn_are_compared_along_the_way():
     """The vehicle turns between two looks by far more than cameras may differ."""
-    way, rate_radps = Way(), 3.0
+    turning, rate_radps, still = Way(), 3.0, standing(400 * MS)
     for stamp_ns in range(0, 201 * MS, 20 * MS):
-        way.go(stamp_ns, Motion(0.0, 0.0, rate_radps))
+        turning.go(stamp_ns, Motion(0.0, 0.0, rate_radps))
     x_m, y_m, psi_rad = worlds.OVERLAP_VIEW
-    later = x_m, y_m, psi_rad + 0.2 * rate_radps
-    first, second = views((x_m, y_m, psi_rad), cameras=[3]), views(later, cameras=[0])
+    first = views((x_m, y_m, psi_rad), cameras=[3])
+    second = views((x_m, y_m, psi_rad + 0.2 * rate_radps), cameras=[0])
     assert first.visible.any()
     assert second.visible.any()
-    watch = twins()
-    watch.remove_twins(first, 0, way)
-    assert watch.remove_twins(second, 200 * MS, way) is second
-    watch = twins()
-    watch.remove_twins(first, 0, standing(400 * MS))
-    # That may be a vehicle that was carried off.
-    assert watch.remove_twins(second, 200 * MS, standing(400 * MS)) is second
-    assert watch.remove_twins(second, 300 * MS, standing(400 * MS)) is second
+    # Without an odometer nothing is known of the way between. One that stands may have been
+    # carried off, until the first camera contradicts that.
+    for way in (turning, Way(), still):
+        watch = twins()
+        watch.remove_twins(first, 0, way)
+        assert watch.remove_twins(second, 200 * MS, way) is second
+    assert watch.remove_twins(second, 300 * MS, still) is second
     assert not watch.seen(300 * MS)
-    assert watch.remove_twins(first, 400 * MS, standing(400 * MS)) is None
-    # Without an odometer nothing is known of the way between.
-    watch = twins()
-    watch.remove_twins(first, 0, Way())
-    assert watch.remove_twins(second, 200 * MS, Way()) is second
+    assert watch.remove_twins(first, 400 * MS, still) is None
 
 
-@pytest.mark.parametrize("noise_px", [pytest.param(0.3, marks=pytest.mark.long), 2.0])
-def test_what_calibration_and_noise_allow_is_one_place(noise_px):
+def test_what_calibration_and_noise_allow_is_one_place():
     """Cameras off by 1 deg and 1 cm, and each of them by 8 deg, wherever two see the marker."""
     rng, seen = np.random.default_rng(0), 0
     for draw in range(40):
@@ -175,7 +169,7 @@ def test_what_calibration_and_noise_allow_is_one_place(noise_px):
         watch = twins(dataclasses.replace(RIG, Ts_camera_vehicle=Ts))
         for look in range(25):
             x_m, y_m = rng.uniform(-1.5, 1.5), rng.uniform(-1.5, 0.6)
-            told = views((x_m, y_m, rng.uniform(-np.pi, np.pi)), noise_px=noise_px, seed=look)
+            told = views((x_m, y_m, rng.uniform(-np.pi, np.pi)), noise_px=2.0, seed=look)
             if told.visible.sum() > 1:
                 watch.remove_twins(told, look * 10_000 * MS, Way())
                 assert not watch.seen(look * 10_000 * MS)
@@ -232,17 +226,13 @@ def test_one_that_was_knocked_loses_its_vote_before_the_filter_gives_up(votes, o
     assert votes.remove_outvoted(off({1: off_deg})) is None
 
 
-def test_what_the_filter_learns_is_not_accused(votes):
-    count(votes, [{0: 0.0, 1: 4.0}] * 100)
-    assert votes.outvoted == ()
-
-
 @pytest.mark.parametrize(
     "frames",
     [
         [{0: 25.0, 1: 40.0}],  # carried off: no camera sees what it should
         [{1: 40.0}],  # the other sees nothing any more
         [{0: 4.0, 1: 7.0}],  # the estimate itself is off
+        [{0: 0.0, 1: 4.0}],  # what the filter learns
     ],
 )
 def test_a_car_that_was_carried_off_blinds_no_camera(votes, frames):
@@ -251,15 +241,12 @@ def test_a_car_that_was_carried_off_blinds_no_camera(votes, frames):
     assert votes.outvoted == ()
 
 
-def test_one_frame_from_before_accuses_once(votes):
+def test_one_frame_from_before_accuses_once_and_nobody_whom_others_left_long_ago(votes):
     count(votes, [{1: 40.0}, {1: 40.0}, {1: 40.0}, {0: 0.1}, *[{1: 40.0}] * 50])
     assert votes.outvoted == ()
     assert votes._votes.tolist() == [0, 1, 0, 0]
-
-
-def test_a_camera_that_others_left_long_ago_is_not_accused(votes):
     for index in range(50):
-        votes.count(off({index % 2: 40.0 * (index % 2)}), DUE_PX, index * 600_000_000)
+        votes.count(off({index % 2: 40.0 * (index % 2)}), DUE_PX, (index + 99) * 600_000_000)
     assert votes.outvoted == ()
 
 
@@ -270,14 +257,6 @@ def test_one_that_sees_what_it_should_gets_its_vote_back(votes):
     assert votes.outvoted == ("right",)
     count(votes, [{1: 1.0}] * 6, 1 << 50)
     assert votes.outvoted == ()
-
-
-def test_corners_that_can_t_be_projected_are_off(votes):
-    due_px = DUE_PX.copy()
-    due_px[1] = np.nan
-    for index in range(5):
-        votes.count(off({0: 0.0, 1: 0.0}), due_px, index * FRAME_NS)
-    assert votes.outvoted == ("right",)
 
 
 def test_it_is_asked_after_contradictions_and_while_a_camera_has_no_vote(votes):

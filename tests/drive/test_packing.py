@@ -24,30 +24,21 @@ def trees(draw):
     return {"first": leaves[:2], "others": tuple(leaves[2:]), "none": None}
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(trees())
 def test_a_tree_is_found_again_bit_for_bit(tree):
     layout = PackedLayout.of(tree)
     packed = layout.pack(tree)
     assert packed.floats.dtype == np.float32
     assert packed.integers.dtype == np.int32
-    for found in (packed.unpack(), packed.fetch().unpack()):
+    written, views = layout.room()
+    for view, leaf in zip(jax.tree.leaves(views), jax.tree.leaves(tree), strict=True):
+        view[...] = leaf
+    for found in (packed.unpack(), packed.fetch().unpack(), written.unpack()):
         assert jax.tree.structure(found) == jax.tree.structure(tree)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
             assert (one.shape, one.dtype) == (other.shape, other.dtype)
             assert np.asarray(one).tobytes() == other.tobytes()
-
-
-@settings(max_examples=20)
-@given(trees())
-def test_what_is_written_to_the_room_is_in_the_vectors(tree):
-    packed, views = PackedLayout.of(tree).room()
-    for view, leaf in zip(jax.tree.leaves(views), jax.tree.leaves(tree), strict=True):
-        view[...] = leaf
-    found = packed.unpack()
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
-        assert one.dtype == other.dtype
-        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

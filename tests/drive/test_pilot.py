@@ -110,7 +110,7 @@ def _stamp_ns(given: Input) -> int:
     return given.frames[0].stamp_ns if given.frames else given.odometry.stamp_ns
 
 
-@pytest.mark.parametrize("delay_ns", [-30 * MS, 40 * MS, 300 * MS])
+@pytest.mark.parametrize("delay_ns", [-30 * MS, 300 * MS])
 def test_late_frames_tell_the_same_as_frames_in_time(setup, inputs, delay_ns):
     """From a second on every frame, which is 30 ms old, comes so much later: -30: in order."""
     late = [
@@ -204,18 +204,8 @@ def test_stamps_that_come_twice_are_refused(setup, inputs):
         assert outcome.data is None
 
 
-@pytest.mark.parametrize("stamp_ns", [0, 2**80])
-def test_stamps_that_no_clock_has_are_refused(setup, inputs, stamp_ns):
-    pilot, _ = handled(setup, inputs[:30])
-    for given in inputs[30:60]:
-        off = _changed(given, lambda part: dataclasses.replace(part, stamp_ns=stamp_ns))
-        outcome = pilot.handle(off)
-        assert Fault.STAMP_INVALID in outcome.faults
-        assert outcome.data is None
-
-
 def _frame_with(**changes):
-    """Frames whose detections have something else; at most four of every marker's numbers."""
+    """Frames whose detections have something else."""
 
     def change(part: Odometry | FrameDetections):
         if isinstance(part, Odometry) or part.detections is None:
@@ -230,43 +220,23 @@ def _frame_with(**changes):
 
 
 def _odometry_with(**changes):
-    def change(part: Odometry | FrameDetections):
-        return dataclasses.replace(part, **changes) if isinstance(part, Odometry) else part
-
-    return change
+    return lambda part: dataclasses.replace(part, **changes) if isinstance(part, Odometry) else part
 
 
-def repeated(*case):
-    """What another case shows as well: for `make test-all`."""
-    return pytest.param(*case, marks=pytest.mark.long)
-
-
-def _one_nan(corners_px: np.ndarray) -> np.ndarray:
-    corners_px[:, 2, 1] = np.nan
-    return corners_px
+ONE_NAN = np.array([[0, 0], [0, 0], [0, math.nan], [0, 0]])
 
 
 @pytest.mark.parametrize(
     ("change", "fault", "reject"),
     [
         (_odometry_with(speed_mps=math.nan), Fault.ODOMETRY_INVALID, Reject(0)),
-        repeated(_odometry_with(speed_mps=-math.inf), Fault.ODOMETRY_INVALID, Reject(0)),
-        repeated(_odometry_with(steering_rad=math.nan), Fault.ODOMETRY_INVALID, Reject(0)),
         (_odometry_with(valid=False), Fault.ODOMETRY_INVALID, Reject(0)),
         (_odometry_with(speed_mps=999.0), Fault(0), Reject.ODOMETRY),
         (_odometry_with(speed_mps=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
-        repeated(_odometry_with(steering_rad=1e300), Fault.ODOMETRY_INVALID, Reject(0)),
         (_frame_with(corners_px=lambda c: c * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        repeated(
-            _frame_with(corners_px=lambda c: c + math.inf), Fault.CORNERS_NOT_FINITE, Reject(0)
-        ),
-        (_frame_with(corners_px=_one_nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        repeated(_frame_with(corners_px=lambda c: c * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
+        (_frame_with(corners_px=lambda c: c + ONE_NAN), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(corners_px=lambda c: c * 0), Fault.FRAME_FROZEN, Reject.INNOVATION),
         (_frame_with(sigma_px=lambda s: s * math.nan), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        repeated(_frame_with(sigma_px=lambda s: s * 0), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        repeated(_frame_with(sigma_px=lambda s: s - 1), Fault.CORNERS_NOT_FINITE, Reject(0)),
-        repeated(_frame_with(sigma_px=lambda s: s * 1e300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(sigma_px=lambda s: s * 1e-300), Fault.CORNERS_NOT_FINITE, Reject(0)),
         (_frame_with(ids=lambda i: i.astype(int) + 9), Fault.UNKNOWN_MARKER, Reject(0)),
     ],
@@ -381,7 +351,7 @@ def fuzzed(draw) -> Input:
     return Input(now_ns, frames=(FrameDetections(camera, now_ns + draw(stamps), found),))
 
 
-@settings(max_examples=30, derandomize=True)
+@settings(max_examples=15, derandomize=True)
 @drawn(st.lists(fuzzed(), max_size=10))
 def test_whatever_comes_in_what_comes_out_is_finite(setup, inputs, told):
     pilot, _ = handled(setup, inputs[:20])
@@ -443,9 +413,9 @@ def test_a_vehicle_that_the_guard_holds_is_known_to_stand_and_to_be_well(setup):
     def hold(given: Input) -> list[Input]:
         return [dataclasses.replace(given, faults=given.faults | Fault.HELD)]
 
-    steps = simulated(setup, 6.0, change=inject.between(1.5, 5.0, hold))
+    steps = simulated(setup, 4.5, change=inject.between(1.5, 3.6, hold))
     held = [step.outcome for step in steps if Fault.HELD in step.outcome.faults]
-    assert len(held) > 200
+    assert len(held) > 120
     assert {outcome.throttle for outcome in held} == {0.0}
     suspicious = Fault.NOTHING_MOVES | Fault.ODOMETRY_STUCK | Fault.ODOMETRY_DOUBTFUL
     assert not any(outcome.faults & suspicious for outcome in held)

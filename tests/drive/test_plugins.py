@@ -1,6 +1,5 @@
 """Plug-ins by name: a plug-in that is found is opened, and any error is one line."""
 
-import importlib.metadata
 import sys
 import tomllib
 from importlib.metadata import EntryPoint
@@ -10,7 +9,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from jaxnav.drive import plugins
-from jaxnav.drive.interfaces import Camera, Vehicle
+from jaxnav.drive.interfaces import Vehicle
 from jaxnav.drive.plugins import CAMERAS, VEHICLES, load_factory, open_cameras, open_vehicle
 from jaxnav.errors import BadInput
 from tests.helpers.setups import GoodCamera, GoodVehicle, good_cameras, setup_with
@@ -70,13 +69,11 @@ def test_cameras_are_found_and_told_of_the_vehicle(module):
         ("somebodys:number", "somebodys:number is an object of the class int, expected a function"),
         ("somebodys:nothing", "somebodys:nothing gives None, which has no timeout_s, read()"),
         ("somebodys:needs_pal", "needs the module pal, which is missing: it comes with Quanser's"),
-        ("somebodys:needs_ros", "needs the module rclpy, which is missing: it comes with ROS 2"),
         ("somebodys:old", "could not be imported: ImportError: cannot import name 'x' from 'y'"),
         ("somebodys:unplugged", "could not be opened: FileNotFoundError: [Errno 2] no /dev/car"),
         ("somebodys:refuses", "--option speed: expected a number"),
         ("somebodys:broken", "could not be opened: IndexError: list index out of range (test_plug"),
         ("somebodys:leaves", "could not be opened: SystemExit: 3 (test_plugins.py:"),
-        ("somebodys:silent", "could not be opened: AssertionError (test_plugins.py:"),
     ],
 )
 def test_what_is_wrong_with_a_vehicle_is_one_line(module, name, problem):
@@ -89,13 +86,11 @@ def test_what_is_wrong_with_a_vehicle_is_one_line(module, name, problem):
     module.number = 3
     module.nothing = lambda setup: None
     module.needs_pal = raises(ModuleNotFoundError("No", name="pal"))
-    module.needs_ros = raises(ModuleNotFoundError("No", name="rclpy"))
     module.old = raises(ImportError("cannot import name 'x' from 'y'"))
     module.unplugged = raises(FileNotFoundError(2, "no /dev/car"))
     module.refuses = raises(BadInput("--option speed", "expected a number"))
     module.broken = lambda setup: [][0]
     module.leaves = raises(SystemExit(3))
-    module.silent = raises(AssertionError())
     with pytest.raises(BadInput) as raised:
         open_vehicle(name, SETUP)
     assert problem in str(raised.value)
@@ -104,12 +99,9 @@ def test_what_is_wrong_with_a_vehicle_is_one_line(module, name, problem):
 
 def test_a_module_that_fails_on_import_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "halfcar.py").write_text("import\n")
-    (tmp_path / "anglecar.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(BadInput, match="--car: halfcar:x: importing halfcar failed: SyntaxErr"):
         open_vehicle("halfcar:x", SETUP)
-    with pytest.raises(BadInput, match="importing anglecar failed: ZeroDivisionError: division"):
-        open_vehicle("anglecar:x", SETUP)
 
 
 @pytest.mark.parametrize("lacking", ["timeout_s", "read", "write", "stop", "close"])
@@ -118,7 +110,7 @@ def test_a_method_that_a_vehicle_lacks_is_named_and_it_is_closed(module, lacking
 
     def factory(setup):
         good = GoodVehicle(setup)
-        members = {name: getattr(good, name) for name in plugins_members(Vehicle)}
+        members = {n: getattr(good, n) for n in vars(Vehicle) if not n.startswith("_")}
         del members[lacking]
         opened.append(good)
         return SimpleNamespace(**members)
@@ -130,30 +122,14 @@ def test_a_method_that_a_vehicle_lacks_is_named_and_it_is_closed(module, lacking
     assert opened[0].closed == (lacking != "close")
 
 
-def plugins_members(protocol):
-    return [name for name in vars(protocol) if not name.startswith("_")]
-
-
-def test_the_protocols_are_looked_at_as_they_are_written():
-    of_vehicle = ["timeout_s", "read()", "write()", "stop()", "close()"]
-    assert plugins.missing_members(object(), Vehicle) == of_vehicle
-    assert plugins.missing_members(object(), Camera) == ["name", "read()", "close()"]
-    assert plugins.missing_members(GoodCamera("front", (1, 1)), Camera) == []
-
-
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
         (lambda cameras: cameras[::-1], "gives the cameras left, rear, right, front, expected"),
         (lambda cameras: cameras[:3], "those of the rig: front, right, rear, left"),
-        (lambda cameras: [], "gives the cameras none, expected those of the rig"),
         (lambda cameras: None, "gives None, expected a sequence of cameras"),
         (lambda cameras: iter(cameras), "of the class list_iterator, expected a sequence"),
-        (lambda cameras: "front", "an object of the class str, expected a sequence"),
-        (
-            lambda cameras: [*cameras[:2], "rear", cameras[3]],
-            "gives an object of the class str as camera 2, which has no name, read(), close()",
-        ),
+        (lambda cameras: [*cameras[:2], "rear", cameras[3]], "class str as camera 2, which"),
     ],
 )
 def test_cameras_that_are_not_the_rigs_are_refused_and_closed(module, change, problem):
@@ -187,12 +163,6 @@ def test_an_error_while_closing_does_not_hide_the_reason(module):
     module.opens = lambda setup: SimpleNamespace(close=unplugged)
     with pytest.raises(BadInput, match="which has no timeout_s"):
         open_vehicle("somebodys:opens", SETUP)
-
-
-def test_names_are_looked_up_where_packages_are_installed(monkeypatch):
-    monkeypatch.setattr(plugins, "entry_points", importlib.metadata.entry_points)
-    with pytest.raises(BadInput, match="--car: there is no 'submarine': expected "):
-        open_vehicle("submarine", SETUP)
 
 
 def declared():

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from contextlib import suppress
 
 import pytest
 
@@ -22,23 +23,13 @@ def nice_of(group) -> int:
     return int(group.read_text().rpartition(" ")[2])
 
 
-def test_all_of_its_terminal_comes_first_meanwhile(group):
-    with priority.before_others():
-        assert nice_of(group) == priority.NICE
-    assert nice_of(group) == 0
-
-
-def test_however_it_ends_the_terminal_is_as_it_was(group):
-    with pytest.raises(KeyError), priority.before_others():
+@pytest.mark.parametrize(("before", "meanwhile"), [(0, priority.NICE), (-15, -15)])
+def test_all_of_its_terminal_comes_first_however_it_ends(group, before, meanwhile):
+    group.write_text(f"/autogroup-42 nice {before}\n")
+    with suppress(KeyError), priority.before_others():
+        assert nice_of(group) == meanwhile
         raise KeyError
-    assert nice_of(group) == 0
-
-
-def test_a_terminal_that_comes_first_already_is_left_alone(group):
-    group.write_text("/autogroup-42 nice -15\n")
-    with priority.before_others():
-        assert nice_of(group) == -15
-    assert group.read_text() == "/autogroup-42 nice -15\n"
+    assert nice_of(group) == before
 
 
 @pytest.fixture

@@ -43,20 +43,6 @@ def test_late_stamps_are_taken_as_they_are(order):
     assert take_all(Stamps(), [(stamp_ns, now_ns) for stamp_ns in told]) == told
 
 
-def test_a_stamp_comes_once():
-    stamps = Stamps()
-    assert stamps.take(BEGIN_NS, BEGIN_NS + 1) == BEGIN_NS
-    assert stamps.take(BEGIN_NS, BEGIN_NS + 2) is None
-    assert stamps.take(BEGIN_NS, BEGIN_NS + 10 * PERIOD_NS) is None
-
-
-def test_zero_and_negative_stamps_are_none():
-    for stamp_ns in (0, -1, -(10**18)):
-        stamps = Stamps()
-        assert all(stamps.take(stamp_ns, BEGIN_NS + k) is None for k in range(3 * JUMP_AFTER))
-        assert stamps.jumps == 0
-
-
 def test_a_little_ahead_is_now_and_more_is_refused():
     assert Stamps().take(BEGIN_NS + FUTURE_NS, BEGIN_NS) == BEGIN_NS
     assert Stamps().take(BEGIN_NS + FUTURE_NS + 1, BEGIN_NS) is None

@@ -175,22 +175,6 @@ def test_whatever_is_told_nothing_raises(events):
         drive.standstill.add_command((10.0 * throttle,), drive.now_ns)
 
 
-def test_the_way_of_an_odometer_is_that_of_the_bicycle():
-    """A quarter of a circle, in steps of 20 ms."""
-    way = Way()
-    tangent = np.tan(0.3)
-    radius_m = 0.256 / (np.cos(np.arctan(tangent / 2)) * tangent)
-    count = 200
-    for step in range(count + 1):
-        way.go(step * 20 * MS, car_motion(radius_m * np.pi / 2 / (count * 0.02), 0.3, WHEELBASE_M))
-    begin, end = way.at(way_begin := (count - 50) * 20 * MS), way.at(count * 20 * MS)
-    x_m, y_m, psi_rad = between(begin, end)
-    assert psi_rad == pytest.approx(np.pi / 8)
-    assert np.hypot(x_m, y_m) == pytest.approx(2 * radius_m * np.sin(np.pi / 16), rel=1e-4)
-    middle = way.at(way_begin + 10 * MS)
-    assert 0 < between(begin, middle)[2] < np.pi / 8 / 50
-
-
 def test_nobody_knows_the_way_before_its_time_after_it_or_across_a_pause():
     way = Way()
     for step in range(100):

@@ -10,22 +10,24 @@ import pytest
 from jaxnav.core.models.vehicle import TwistBase
 from jaxnav.drive.flags import Fault, Health
 from jaxnav.drive.interfaces import Odometry, TwistOdometry
-from jaxnav.drive.pilot import Input, Outcome
+from jaxnav.drive.pilot import Input
 from jaxnav.files import Route
 from jaxnav.recordings.drive_log import read_drive
 from jaxnav.recordings.drive_replay import first_difference, replay_drive
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.records import digest
 from jaxnav.sim.bases import equipped
 from jaxnav.vehicles.conformance import injections as inject
+from jaxnav.vehicles.conformance.faults import WAYPOINTS_M
 from jaxnav.vehicles.conformance.lockstep import BEGIN_NS, Step, drive
 from jaxnav.vehicles.world import SimWorld
 from tests import worlds
 from tests.helpers.simulated import record
 
-ROUTE = Route(((1.30, 0.0), (0.50, 0.65)), 0.15, worlds.START_VIEW)
+# As many waypoints as the fault matrix has, whose program does for these drives as well.
+COUNT = len(WAYPOINTS_M)
+ROUTE = Route(((1.30, 0.0), *[(0.50, 0.65)] * (COUNT - 1)), 0.15, worlds.START_VIEW)
 # Behind it: it turns on the spot, away from the marker.
-BEHIND = Route(((2.6, -1.9),), 0.15, worlds.START_VIEW)
+BEHIND = Route(((2.6, -1.9),) * COUNT, 0.15, worlds.START_VIEW)
 
 
 def base() -> TwistBase:
@@ -132,22 +134,19 @@ def late(by_s):
     return lambda one: [dataclasses.replace(one, stamp_ns=one.stamp_ns - by_ns)]
 
 
-def repeated(*case):
-    """What another case shows as well: for `make test-all`."""
-    return pytest.param(*case, marks=pytest.mark.long)
-
-
 @pytest.mark.parametrize(
     ("edit", "faults"),
     [
-        (lambda one: [], Fault.GYRO_STALE),
-        (with_rate(math.nan), Fault.GYRO_INVALID | Fault.GYRO_STALE),
-        repeated(with_rate(-math.inf), Fault.GYRO_INVALID | Fault.GYRO_STALE),
-        repeated(with_rate(math.radians(2000.0)), Fault.GYRO_INVALID | Fault.GYRO_STALE),
         (with_rate(-0.25), Fault.GYRO_INVALID | Fault.GYRO_STALE),  # it repeats itself
-        repeated(late(0.3), Fault.STAMP_INVALID | Fault.GYRO_STALE),
-        (late(2.0), Fault.STAMP_INVALID | Fault.GYRO_STALE | Fault.CLOCK_JUMPED),
-        repeated(lambda one: [one, one], Fault.STAMP_INVALID),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (
+                (late(2.0), Fault.STAMP_INVALID | Fault.GYRO_STALE | Fault.CLOCK_JUMPED),
+                (lambda one: [], Fault.GYRO_STALE),
+                (with_rate(math.nan), Fault.GYRO_INVALID | Fault.GYRO_STALE),
+                (lambda one: [one, one], Fault.STAMP_INVALID),
+            )
+        ),
     ],
 )
 def test_a_gyro_that_fails_is_named_and_the_drive_goes_on_without(setup, edit, faults):
@@ -159,6 +158,7 @@ def test_a_gyro_that_fails_is_named_and_the_drive_goes_on_without(setup, edit, f
     assert not steps[-1].outcome.faults
 
 
+@pytest.mark.long
 def test_a_wheel_that_runs_away_is_refused(setup):
     """Ten times the turn rate for half a second, then nothing for half a second."""
 
@@ -202,29 +202,6 @@ def test_what_is_no_twist_is_not_fused(setup, steps, reading):
     assert Fault.ODOMETRY_INVALID in outcome.faults
     assert outcome.data is None
     assert outcome.command == (0.0, 0.0, 0.0)
-
-
-def test_nothing_that_is_told_gets_a_command_past_the_limits(setup, steps):
-    """Bits of any kind in every reading."""
-    rng = np.random.default_rng(0)
-    pilot, numbers = setup.pilot(None), [math.nan, math.inf, 1e300, -3.0, 0.0, 0.4]
-    outcomes: list[Outcome] = []
-    for step in steps[:150]:
-        read = step.input.odometry
-        if read is not None:
-            parts = rng.choice(numbers, 3).tolist()
-            read = TwistOdometry(read.stamp_ns, *parts)
-        told = tuple(
-            dataclasses.replace(one, turn_radps=float(rng.choice(numbers)))
-            for one in step.input.gyro
-        )
-        outcomes.append(pilot.handle(dataclasses.replace(step.input, odometry=read, gyro=told)))
-    commands = np.array([outcome.command for outcome in outcomes])
-    limits = pilot.limits
-    assert np.isfinite(commands).all()
-    most = [limits.forward_mps, limits.left_mps, limits.turn_radps]
-    assert (np.abs(commands) <= most).all()
-    assert len({digest(outcome) for outcome in outcomes}) > 1
 
 
 def test_corners_that_rest_while_it_turns_are_a_frozen_camera(setup):

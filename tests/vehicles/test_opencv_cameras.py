@@ -58,6 +58,9 @@ def test_video_files_keep_the_promises_of_cameras(video):
 
 
 def test_a_video_is_played_once_from_its_beginning_at_its_rate(video):
+    capture = opencv_cameras._Capture("", video, SIZE_PX, 0)
+    assert float(capture.grab().image.mean()) == pytest.approx(GREYS[0], abs=3)  # none is lost
+    capture.release()
     front, right = from_sources(video, latency_ms="30")
     right.close()
     frames, error = read_until_it_fails(front)
@@ -72,16 +75,9 @@ def test_a_video_is_played_once_from_its_beginning_at_its_rate(video):
     assert took_s == pytest.approx(pictures / RATE_HZ, abs=0.1)
 
 
-def test_no_picture_of_a_video_is_lost_to_the_look_at_its_size(video):
-    capture = opencv_cameras._Capture("", video, SIZE_PX, 0)
-    assert float(capture.grab().image.mean()) == pytest.approx(GREYS[0], abs=3)
-    capture.release()
-
-
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        ({}, "--option source.front: missing"),
         ({"source__front": "VIDEO"}, "--option source.right: missing"),
         (
             {"source__front": "VIDEO", "source__right": "VIDEO", "source__top": "0"},
@@ -89,27 +85,17 @@ def test_no_picture_of_a_video_is_lost_to_the_look_at_its_size(video):
         ),
         (
             {"source__front": "VIDEO", "source__right": "no.avi"},
-            "--option source.right: there is no device or file no.avi",
+            "there is no device or file",
         ),
-        (
-            {"source__front": "/dev/video987", "source__right": "VIDEO"},
-            "--option source.front: /dev/video987 can't be opened",
-        ),
-        (
-            {"source__front": "VIDEO", "source__right": "TEXT"},
-            "--option source.right: .*drive.txt can't be opened",
-        ),
+        ({"source__front": "/dev/video987", "source__right": "VIDEO"}, "video987 can't be opened"),
         (
             {"source__front": "VIDEO", "source__right": "VIDEO", "latency_ms": "x"},
             "--option latency_ms: expected a number from 0 to 1000, got 'x'",
         ),
     ],
 )
-def test_a_wrong_source_is_one_line(video, tmp_path, options, problem, capfd):
-    text = tmp_path / "drive.txt"
-    text.write_text("no video")
-    named = {"VIDEO": video, "TEXT": str(text)}
-    options = {key: named.get(value, value) for key, value in options.items()}
+def test_a_wrong_source_is_one_line(video, options, problem, capfd):
+    options = {key: video if value == "VIDEO" else value for key, value in options.items()}
     with pytest.raises(BadInput, match=problem):
         open_cameras(setup_with(RIG, **options), None)
 
@@ -122,12 +108,6 @@ def test_pictures_of_another_size_are_refused(video, tmp_path):
 
 
 PIPELINE = "nvarguscamerasrc sensor-id=0 ! nvvidconv ! appsink"
-
-
-def test_a_pipeline_needs_gstreamer_and_the_line_says_so(monkeypatch):
-    monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GStreamer:        NO\n")
-    with pytest.raises(BadInput, match=r"source.front: this OpenCV was built without GStreamer"):
-        from_sources(PIPELINE)
 
 
 class FakeCapture:
@@ -184,14 +164,10 @@ def test_devices_keep_the_promises_of_cameras(device):
     assert right.released
 
 
-def test_a_name_that_udev_gave_leads_to_its_device(device, tmp_path, monkeypatch):
-    assert opencv_cameras._device("/dev/video3") == 3
-    assert opencv_cameras._device("/dev/null") is None
-    monkeypatch.setattr(opencv_cameras.Path, "resolve", lambda path: "/dev/video5")
-    assert opencv_cameras._device("/dev/v4l/by-id/usb-camera") == 5
-
-
-def test_gstreamer_gets_the_pipeline(device, monkeypatch):
+def test_gstreamer_gets_the_pipeline_where_it_is_built_in(device, monkeypatch):
+    monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GStreamer:        NO\n")
+    with pytest.raises(BadInput, match=r"source.front: this OpenCV was built without GStreamer"):
+        from_sources(PIPELINE)
     monkeypatch.setattr(cv2, "getBuildInformation", lambda: "  GStreamer:        YES (1.20.3)\n")
     for camera in from_sources(PIPELINE):
         camera.close()

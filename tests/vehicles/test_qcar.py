@@ -39,25 +39,19 @@ def car(hardware):
     vehicle.close()
 
 
-def test_it_keeps_the_promises_of_a_vehicle(hardware):
+def test_vehicle_and_cameras_keep_their_promises(hardware):
     check_vehicle(open_vehicle, SETUP, lambda vehicle: hardware.throttle)
     assert "terminate" in hardware.calls
-
-
-def test_its_cameras_keep_theirs(hardware):
     check_cameras(open_cameras, SETUP)
     assert all(camera.terminated for camera in hardware.cameras.csi)
 
 
-def test_it_reads_the_tachometer(hardware, car):
-    hardware.tach_mps = -0.75
-    reading = car.read()
-    assert reading.speed_mps == -0.75
-    assert reading.valid
-
-
 def test_a_reading_that_repeats_is_not_valid_until_it_changes(hardware, car):
-    assert car.read().valid
+    hardware.tach_mps = -0.75
+    for _ in range(30):  # one sensor alone may repeat: a car that stands has the same speed
+        reading = car.read()
+        assert (reading.speed_mps, reading.valid) == (-0.75, True)
+        time.sleep(0.003)
     hardware.fails = True
     stale = [car.read()]
     while stale[-1].valid and len(stale) < 1000:
@@ -66,13 +60,6 @@ def test_a_reading_that_repeats_is_not_valid_until_it_changes(hardware, car):
     assert 5 <= len(stale) < 100
     hardware.fails = False
     assert car.read().valid
-
-
-def test_one_sensor_alone_may_repeat(hardware, car):
-    """A car that stands has the same encoder and the same speed all the time."""
-    for _ in range(30):
-        assert car.read().valid
-        time.sleep(0.003)
 
 
 def test_it_reports_the_steering_that_the_servo_has_reached(hardware, car):
@@ -193,19 +180,15 @@ def test_a_write_that_overtakes_a_stop_and_hangs_is_undone(hardware, car, monkey
     assert hardware.throttle == 0
 
 
-def test_errors_of_the_driver_are_oserrors(hardware, car, monkeypatch):
-    monkeypatch.delattr(type(hardware.car), "read_write_std")
-    with pytest.raises(OSError, match="the QCar's driver: AttributeError"):
-        car.read()
-    monkeypatch.undo()
-
-
-def test_a_closed_car_says_so(hardware, car):
+def test_errors_of_the_driver_are_oserrors_and_a_closed_car_says_so(hardware, car, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.delattr(type(hardware.car), "read_write_std")
+        with pytest.raises(OSError, match="the QCar's driver: AttributeError"):
+            car.read()
     car.close()
-    with pytest.raises(OSError, match="closed"):
-        car.read()
-    with pytest.raises(OSError, match="closed"):
-        car.write(0.0, 0.1)
+    for call in (car.read, lambda: car.write(0.0, 0.1)):
+        with pytest.raises(OSError, match="closed"):
+            call()
     count = len(hardware.calls)
     car.stop()
     assert len(hardware.calls) == count  # the board belongs to somebody else by now
@@ -232,12 +215,9 @@ def cameras(setup):
     ("opens", "option", "value", "problem"),
     [
         (open_vehicle, "frequency", "fast", "expected a number from 100 to 1000, got 'fast'"),
-        (open_vehicle, "frequency", "nan", "expected a number from 100 to 1000"),
-        (open_vehicle, "frequency", "20", "expected a number from 100 to 1000"),
         (open_vehicle, "frequency", "150.5", "expected a whole number, got '150.5'"),
         (open_vehicle, "read_mode", "2", "expected a number from 0 to 1"),
         (cameras, "frame_rate", "0", "expected a number"),
-        (cameras, "latency_ms", "-1", "expected a number"),
         (cameras, "latency_ms", "inf", "expected a number"),
     ],
 )
@@ -266,36 +246,32 @@ def test_a_rig_that_a_qcar_has_not_is_refused(hardware, rig, problem):
         open_cameras(setup_with(rig), None)
 
 
-def test_each_camera_shows_its_own_side_late_by_its_latency(hardware):
+def falls_silent(camera) -> bool:
+    """Whether nothing comes any more, but for what was under way."""
+    return any(camera.read(0.05) is None for _ in range(5))
+
+
+def test_each_camera_shows_its_own_side_late_by_its_latency_and_no_picture_twice(
+    hardware, monkeypatch
+):
     cameras = open_cameras(setup_with(SETUP.rig.first(2), latency_ms="20"), None)
     try:
+        front = cameras[0]
         assert [camera.name for camera in cameras] == ["front", "right"]
         assert hardware.cameras.csiLeft is None
         assert hardware.cameras.csiBack is None
-        frame = cameras[0].read(1.0)
+        frame = front.read(1.0)
         assert time.monotonic_ns() - frame.stamp_ns >= 20_000_000
         hardware.pictures = False
-        cameras[0].read(0.05)  # what was under way
-        assert cameras[0].read(0.05) is None
+        assert falls_silent(front)
         shown = hardware.cameras.csiFront.imageData.copy()
         hardware.pictures = True
-        assert not np.array_equal(cameras[0].read(1.0).image, shown)
+        assert not np.array_equal(front.read(1.0).image, shown)
+        monkeypatch.setattr(hardware.cameras.csiFront, "read", lambda: None)  # it says nothing
+        assert falls_silent(front)
     finally:
         for camera in cameras:
             camera.close()
-
-
-def test_a_driver_that_repeats_its_picture_gives_no_frame(hardware, monkeypatch):
-    camera, *others = open_cameras(SETUP, None)
-    try:
-        assert camera.read(1.0) is not None
-        maker = hardware.cameras.csiFront
-        monkeypatch.setattr(maker, "read", lambda: None)  # as one that says nothing
-        camera.read(0.05)
-        assert camera.read(0.05) is None
-    finally:
-        for one in (camera, *others):
-            one.close()
 
 
 def test_without_the_makers_software_a_person_hears_where_it_is_from(monkeypatch):

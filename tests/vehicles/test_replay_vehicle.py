@@ -218,16 +218,19 @@ def test_cameras_show_what_was_found_when_it_was_found(drive):
     assert cameras[FRONT].read(60.0) is None
 
 
-def test_cameras_come_by_their_names_in_whatever_rig(drive):
-    order = [2, 0]
-    rig = SETUP.rig.first(3)
-    swapped = dataclasses.replace(rig.first(2), names=tuple(rig.names[c] for c in order))
-    setup = dataclasses.replace(setup_with(drive=str(drive)), rig=swapped)
-    cameras = open_cameras(setup, ReplayVehicle(setup))
-    assert [camera.name for camera in cameras] == list(swapped.names)
-    shown = [frames_of(camera, 1)[0].detections for camera in cameras]
-    for found, original in zip(shown, INPUTS[1].frames[::-1], strict=True):
+def test_cameras_come_by_their_names_in_whatever_rig_or_are_refused(drive):
+    setup, rig = setup_with(drive=str(drive)), SETUP.rig.first(2)
+    swapped = dataclasses.replace(setup, rig=dataclasses.replace(rig, names=("rear", "front")))
+    shown = open_cameras(swapped, ReplayVehicle(swapped))
+    assert [camera.name for camera in shown] == ["rear", "front"]
+    for camera, original in zip(shown, INPUTS[1].frames[::-1], strict=True):
+        found = frames_of(camera, 1)[0].detections
         assert np.array_equal(found.corners_px, original.detections.corners_px)
+    with pytest.raises(BadInput, match="--cameras: replay shows what --car replay has"):
+        open_cameras(setup, GoodVehicle(setup))
+    other = dataclasses.replace(setup, rig=dataclasses.replace(rig.first(1), names=("top",)))
+    with pytest.raises(BadInput, match=r"--rig: .*drive.mcap has no camera 'top': it has front,"):
+        open_cameras(other, ReplayVehicle(other))
 
 
 def pictures(topic="/camera/front", size_px=(820, 410), last: object = b"no jpeg"):
@@ -255,7 +258,6 @@ def test_cameras_show_the_recorded_images_where_that_is_asked_for(tmp_path):
         ([], "holds no image on /camera/front, /camera/right, /camera/rear, /camera/left"),
         (pictures("/camera/top"), "holds no image on /camera/front"),
         (pictures()[2:], "/camera/front: an image can't be decoded"),
-        ([("/camera/front", at(10), b"")], "/camera/front: an image can't be decoded"),
         (pictures(size_px=(32, 24)), "/camera/front: the images are 32 x 24 px, but the rig's"),
     ],
 )
@@ -268,25 +270,6 @@ def test_images_that_are_not_there_or_not_the_rigs_are_refused(tmp_path, images,
     assert problem in str(caught.value)
 
 
-def test_cameras_that_were_not_recorded_are_refused(drive):
-    setup = setup_with(drive=str(drive))
-    with pytest.raises(BadInput, match="--cameras: replay shows what --car replay has"):
-        open_cameras(setup, GoodVehicle(setup))
-    other = dataclasses.replace(SETUP.rig.first(1), names=("top",))
-    other_setup = dataclasses.replace(setup, rig=other)
-    with pytest.raises(BadInput, match=r"--rig: .*drive.mcap has no camera 'top': it has front,"):
-        open_cameras(other_setup, ReplayVehicle(other_setup))
-
-
-def test_its_own_files_are_those_that_it_was_recorded_with(drive):
-    own = ReplayVehicle.own_files({"drive": str(drive)})
-    assert own.rig.names == SETUP.rig.names
-    assert own.route == SETUP.route
-    assert np.array_equal(own.markers.corners_world_m, SETUP.markers.corners_world_m)
-    assert own.vehicle.wheelbase_m == SETUP.vehicle.wheelbase_m
-
-
-BACKWARDS = (INPUTS[1], INPUTS[0])
 STRANGER = (Input(at(0), frames=(seen(9, at(0)),)),)
 
 
@@ -294,16 +277,9 @@ STRANGER = (Input(at(0), frames=(seen(9, at(0)),)),)
     ("options", "line"),
     [
         ([], "--option drive: missing: the recorded drive (.mcap)"),
-        (["drive="], "--option drive: missing"),
         (["drive={tmp}/gone.mcap"], "{tmp}/gone.mcap: can't be read: no such file"),
-        (["drive={tmp}"], "{tmp}: is a folder"),
-        (["drive={tmp}/text.mcap"], "{tmp}/text.mcap: is not an MCAP file"),
-        (["drive={tmp}/empty.mcap"], "{tmp}/empty.mcap: holds no input"),
-        (["drive={tmp}/back.mcap"], "{tmp}/back.mcap: now_ns[1]: is less than"),
         (["drive={tmp}/strange.mcap"], "{tmp}/strange.mcap: /frames.camera: must be from 0 to 3"),
-        (["drive={tmp}/header.mcap"], "{tmp}/header.mcap: header.setup_version: missing"),
         (["drive={tmp}/good.mcap", "images=yes"], "--option images: expected false or true"),
-        (["drive={tmp}/good.mcap", "images=true"], "{tmp}/good.mcap: holds no image"),
     ],
 )
 def test_bad_input_gets_one_line_before_anything_is_compiled(
@@ -313,11 +289,7 @@ def test_bad_input_gets_one_line_before_anything_is_compiled(
         "jaxnav.commands.drive.run.compiled_pilot", lambda *told: pytest.fail("compiles")
     )
     recorded(tmp_path / "good.mcap")
-    (tmp_path / "text.mcap").write_text("a drive?\n" * 9)
-    recorded(tmp_path / "empty.mcap", [])
-    recorded(tmp_path / "back.mcap", BACKWARDS)
     recorded(tmp_path / "strange.mcap", STRANGER)
-    recorded(tmp_path / "header.mcap", header={"rig": {}})
     given = [part for text in options for part in ("--option", text.format(tmp=tmp_path))]
     assert cli.main(["run", "--float64", "--headless", *NAMES, *given]) == 2
     told = capsys.readouterr()
@@ -343,7 +315,7 @@ def told(log) -> tuple[dict, dict]:
     return readings, corners
 
 
-def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
+def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys, monkeypatch):
     """The first second and a half of a drive.
 
     The loop gets the recorded readings and corners, at their own stamps, whatever a busy machine
@@ -355,6 +327,8 @@ def test_the_real_loop_comes_to_what_was_recorded(tmp_path, capsys):
     inputs = [i for i in whole.inputs if i.now_ns - whole.inputs[0].now_ns < 1_500 * MS]
     short, again = recorded(tmp_path / "short.mcap", inputs, header=whole.header), tmp_path / "b"
     options = ("--option", f"drive={short}", "--record", str(again), "--timeout-s", "3")
+    options = (*options, "--detector", "decode-only")  # it has no images
+    monkeypatch.setattr("jaxnav.commands.drive.run.step_folder", lambda: None)  # one for both
     assert cli.main(["run", "--float64", "--headless", *NAMES, *options]) == 0
     assert capsys.readouterr().out.startswith("ended: the recording is over\n")
     log = read_drive(again)
@@ -402,9 +376,11 @@ def test_flags_go_before_the_recordings_own_files(tmp_path, drive, monkeypatch):
     save_rig(tmp_path / "rig.yaml", SETUP.rig.first(1))
     options = ("--option", f"drive={drive}", "--rig", str(tmp_path / "rig.yaml"))
     assert cli.main(["run", "--float64", "--headless", *NAMES, *options]) == 2
-    assert given[0].rig.names == ("front",)
-    assert given[0].route == SETUP.route
-    assert given[0].selector == "multi-hypothesis"
+    (own,) = given
+    assert (own.rig.names, own.route) == (("front",), SETUP.route)
+    assert own.selector == "multi-hypothesis"
+    assert np.array_equal(own.markers.corners_world_m, SETUP.markers.corners_world_m)
+    assert own.vehicle.wheelbase_m == SETUP.vehicle.wheelbase_m
 
 
 def test_a_base_tells_its_twist_and_its_gyro_again(tmp_path, now):

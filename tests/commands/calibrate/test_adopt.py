@@ -23,7 +23,7 @@ SENSORS, SENSORS_SIGMA = np.array([0.02, -0.01, 0.004, 0.012]), np.array([2, 10,
 CAMERA = 1
 
 
-def setup_of(**changes):
+def setup_of():
     setup = make_setup()
     vehicle = dataclasses.replace(
         setup.vehicle,
@@ -33,7 +33,7 @@ def setup_of(**changes):
         steering_offset_rad=0.02,
         camera_delay_s=0.01,
     )
-    return dataclasses.replace(setup, rig=told_rig(), vehicle=vehicle, float64=True, **changes)
+    return dataclasses.replace(setup, rig=told_rig(), vehicle=vehicle, float64=True)
 
 
 def learnt_outcome(index: int, learnt: bool = True, decided: bool = True):
@@ -62,8 +62,8 @@ def learnt_outcome(index: int, learnt: bool = True, decided: bool = True):
     return dataclasses.replace(outcome, output=output, belief=belief)
 
 
-def record(path, outcomes, setup=None):
-    recorder = Recorder(path, (setup or setup_of()).header())
+def record(path, outcomes):
+    recorder = Recorder(path, setup_of().header())
     for outcome in outcomes:
         recorder.put(OUTCOME, outcome.now_ns, outcome_message(outcome))
     recorder.close()
@@ -121,31 +121,29 @@ def test_a_rig_with_finer_figures_keeps_them(recording, tmp_path):
 
 
 @pytest.mark.parametrize("flag", ["--rig", "--vehicle"])
-def test_files_of_another_drive_are_refused(recording, tmp_path, capsys, flag):
+def test_files_of_another_drive_are_refused(recording, tmp_path, refusal, flag):
     setup, path = setup_of(), tmp_path / "other.yaml"
     if flag == "--rig":
         save_rig(path, turned(setup.rig, 0, np.array([0, 0, 0.01])))
     else:
         save_vehicle(path, dataclasses.replace(setup.vehicle, speed_scale=1.2))
-    assert adopt(recording, flag, path, "--out", tmp_path / "out") == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    words = (recording, flag, path, "--out", tmp_path / "out", "--headless")
+    line = refusal("calibrate", "adopt", *words)
     assert str(path) in line
     assert "was driven with" in line
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"),
-    [("one pose", "a rule of one pose"), ("undecided", "never was sure"), ("none", "a rule of")],
+    ("outcomes", "says"),
+    [
+        ([learnt_outcome(1, learnt=False)], "a rule of one pose"),
+        ([learnt_outcome(1, decided=False)], "never was sure"),
+        ([], "a rule of"),
+    ],
 )
-def test_a_drive_that_has_learnt_nothing_is_refused(tmp_path, capsys, kind, says):
-    outcomes = {
-        "one pose": [learnt_outcome(1, learnt=False)],
-        "undecided": [learnt_outcome(1, decided=False)],
-        "none": [],
-    }[kind]
+def test_a_drive_that_has_learnt_nothing_is_refused(tmp_path, refusal, outcomes, says):
     path = record(tmp_path / "drive.mcap", outcomes)
-    assert adopt(path, "--out", tmp_path / "out") == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert says in line
+    words = ("calibrate", "adopt", path, "--out", tmp_path / "out", "--headless")
+    assert says in refusal(*words)
     assert not (tmp_path / "out").exists()

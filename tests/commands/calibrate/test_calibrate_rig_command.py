@@ -18,7 +18,6 @@ from jaxnav.drive.interfaces import Odometry
 from jaxnav.drive.pilot import Input
 from jaxnav.files import load_markers, load_rig, save_markers, save_rig
 from jaxnav.recordings.drive_setup import DriveSetup
-from jaxnav.recordings.other.recordings import read_sightings
 from jaxnav.recordings.recorder import Recorder
 from jaxnav.recordings.records import input_message
 from tests.helpers.setups import setup_with
@@ -76,17 +75,6 @@ def told(capsys, *words) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_a_drive_is_read_with_all_that_it_saw(drive):
-    seen = read_sightings(drive / "drive.mcap")
-    assert set(seen.ids.tolist()) == set(range(8))
-    assert seen.families is not None
-    assert set(seen.families) == {"tag36h11"}
-    assert len(seen.stamps_ns) == FRAMES
-    assert len(seen.odometry) == FRAMES
-    assert seen.markers is not None
-    assert seen.markers.ids == (0,)
-
-
 def test_rig_writes_what_other_commands_read(drive, tmp_path, capsys):
     code, out, err = told(capsys, "rig", drive / "drive.mcap", "--out", tmp_path)
     assert (code, err) == (0, "")
@@ -119,6 +107,7 @@ def test_coverage_counts_cells():
     assert coverage(np.zeros((0, 4, 2)), (100, 50)) == 0
 
 
+@pytest.mark.long
 def test_one_camera_may_hold_the_frame(drive, tmp_path, capsys):
     words = ("--vehicle-frame", "left", "--out", tmp_path)
     code, _, err = told(capsys, "rig", drive / "drive.mcap", *words)
@@ -161,77 +150,52 @@ def test_what_nobody_saw_stays_in_the_map_and_recordings_follow_each_other(
     assert np.all(np.diff(times) > 0)
 
 
-def test_check_names_the_marker_that_was_entered_wrongly(drive, tmp_path, capsys, room):
+def test_check_is_content_with_a_right_map_and_names_the_marker_that_was_entered_wrongly(
+    drive, tmp_path, capsys, room
+):
     moved = room.copy()
     moved[3, :3, 3] += [0.69, 0, 0]
     save_markers(tmp_path / "map.yaml", rig_rooms.as_map(moved))
-    words = ("--rig", drive / "true.yaml", "--markers", tmp_path / "map.yaml")
-    code, out, err = told(capsys, "check", drive / "drive.mcap", *words, "--out", tmp_path)
+    words = ("--rig", drive / "true.yaml", "--out", tmp_path, "--markers")
+    code, out, err = told(capsys, "check", drive / "drive.mcap", *words, tmp_path / "map.yaml")
     assert (code, err) == (1, "")
     assert "7 of 8 markers agree" in out
     assert "marker 3: is 0.69" in out
     report = json.loads((tmp_path / "report.json").read_text())
     wrong = [name for name, of in report["verdicts"].items() if not of["right"]]
     assert wrong == ["tag36h11 3"]
-
-
-def test_check_is_content_with_a_right_map(drive, tmp_path, capsys):
-    words = ("--rig", drive / "true.yaml", "--markers", drive / "all.yaml")
-    code, out, err = told(capsys, "check", drive / "drive.mcap", *words, "--out", tmp_path)
+    code, out, err = told(capsys, "check", drive / "drive.mcap", *words, drive / "all.yaml")
     assert (code, err) == (0, "")
     assert "all markers that could be linked are where the map says" in out
 
 
-def ten_times(folder: Path, room: np.ndarray, index: int | None) -> Path:
-    """A map with one size, or all, ten times too large."""
+def test_sizes_ten_times_too_large_are_refused(drive, tmp_path, capsys, room):
+    """Of one marker, and of all."""
     markers = rig_rooms.as_map(room)
-    scale = np.ones(8) * (10.0 if index is None else 1.0)
-    if index is not None:
-        scale[index] = 10
-    file = folder / "ten.yaml"
-    save_markers(file, dataclasses.replace(markers, size_m=markers.size_m * scale))
-    return file
-
-
-def test_a_size_ten_times_too_large_is_refused(drive, tmp_path, capsys, room):
-    one = ten_times(tmp_path, room, 5)
-    words = ("--markers", one, "--out", tmp_path / "out")
-    code, _, err = told(
-        capsys, "markers", drive / "drive.mcap", "--rig", drive / "true.yaml", *words
-    )
-    assert code == 2
-    assert err.count("\n") == 1
-    assert "size_m: marker 5 looks 0.17" in err
-    assert "measure its black square" in err
-    assert not (tmp_path / "out").exists()
-
-
-def test_all_sizes_ten_times_too_large_are_refused(drive, tmp_path, capsys, room):
-    one = tmp_path / "one.yaml"
-    save_markers(one, rig_rooms.as_map(room[:1], size_m=1.72))
-    words = ("--markers", one, "--out", tmp_path / "out")
-    code, _, err = told(capsys, "rig", drive / "drive.mcap", *words)
-    assert code == 2
-    assert "times as far apart as the rig says: is the size of the markers right" in err
-    assert not (tmp_path / "out").exists()
+    size_m = markers.size_m * np.where(np.arange(8) == 5, 10.0, 1.0)
+    save_markers(tmp_path / "five.yaml", dataclasses.replace(markers, size_m=size_m))
+    save_markers(tmp_path / "all.yaml", rig_rooms.as_map(room[:1], size_m=1.72))
+    for command, file, more, line in (
+        ("markers", "five", ["--rig", drive / "true.yaml"], "size_m: marker 5 looks 0.17"),
+        ("rig", "all", [], "as far apart as the rig says: is the size of the markers right"),
+    ):
+        words = ("--markers", tmp_path / f"{file}.yaml", "--out", tmp_path / "out", *more)
+        code, _, err = told(capsys, command, drive / "drive.mcap", *words)
+        assert (code, err.count("\n")) == (2, 1)
+        assert line in err
+        assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
-        (["rig"], "RECORDING: missing"),
-        (["rig", "nothing.mcap"], "nothing.mcap: there is no such file"),
         (["rig", "DRIVE", "--vehicle-frame", "roof"], "--vehicle-frame: must be one of places, "),
         (["rig", "DRIVE", "--family", "tag99"], "--family: unknown 'tag99'"),
-        (["rig", "DRIVE", "--marker-size-m", "0"], "--marker-size-m: must be from 0.001"),
         (["check", "DRIVE"], "one marker of the map was seen, two at least must be"),
         (["check", "DRIVE", "--tolerance-m", "-1"], "--tolerance-m: must be greater than 0"),
     ],
 )
-def test_bad_input_gets_one_line(drive, tmp_path, capsys, words, problem):
-    words = [str(drive / "drive.mcap") if word == "DRIVE" else word for word in words]
-    code, out, err = told(capsys, *words, "--out", tmp_path / "out")
-    assert (code, out) == (2, "")
-    assert problem in err
-    assert err.count("\n") == 1
+def test_bad_input_gets_one_line(drive, tmp_path, refusal, words, problem):
+    words = [drive / "drive.mcap" if word == "DRIVE" else word for word in words]
+    assert problem in refusal("calibrate", *words, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()

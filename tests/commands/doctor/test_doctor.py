@@ -85,23 +85,6 @@ def test_a_check_that_breaks_hides_no_other(capsys, monkeypatch):
     assert lines_with(out, "ok ", "compile cache")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        ("--frame front", "jaxnav doctor: --frame: expected CAMERA=IMAGE, got 'front'"),
-        ("--frame =a.png", "jaxnav doctor: --frame: expected CAMERA=IMAGE"),
-        ("--option speed", "jaxnav doctor: --option: expected KEY=VALUE, got 'speed'"),
-        ("--option a=1 --option a=2", "jaxnav doctor: --option: a is given twice"),
-        ("--speed", "jaxnav doctor: Unrecognized options: --speed"),
-    ],
-)
-def test_wrong_usage_is_one_line(capsys, arguments, line):
-    assert cli.main(["doctor", *arguments.split()]) == cli.EXIT_BAD_INPUT
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith(line)
-
-
 def test_pictures_are_named_by_their_cameras(capsys, tmp_path):
     image = tmp_path / "a=b.png"
     cv2.imwrite(str(image), np.full((410, 820), 90, np.uint8))
@@ -126,25 +109,23 @@ def test_plug_ins_get_their_options(capsys, monkeypatch):
     assert setup.start_pose[:2] == (2.0, -1.0)
 
 
+def wrong():
+    raise BadInput("--flag", "is wrong")
+
+
 def test_the_report():
     report = Report()
     assert (report.exit_code, report.summary()) == (0, "")
     report.examine("a", lambda: [Finding("a", "note", "x"), Finding("a", "warning", "y")])
     assert report.exit_code == 0
-
-    def wrong():
-        raise BadInput("--flag", "is wrong")
-
     report.add(Finding("c", "error", "broken"))
     assert report.exit_code == 1
     report.examine("d", wrong)
     assert report.exit_code == 2
     assert [finding.what for finding in report.findings] == ["x", "y", "broken", "--flag: is wrong"]
     assert report.summary() == "2 errors, 1 warning, 1 note"
-    assert (
-        str(Finding("a", "error", "x\ny", "z"))
-        == "ERROR    a              x y\n" + " " * 9 + "do: z"
-    )
+    told = "ERROR    a              x y\n" + " " * 9 + "do: z"
+    assert str(Finding("a", "error", "x\ny", "z")) == told
 
 
 def test_every_finding_has_its_words_and_something_to_do():

@@ -84,11 +84,8 @@ def test_a_true_map_is_in_order(images):
     [
         (jaxlie.SO3.from_z_radians(np.pi / 2), "by 270 deg: the first one in the map is the"
          " printed bottom-left", "2 3 4 1"),
-        (jaxlie.SO3.from_z_radians(-np.pi / 2), "by 90 deg: the first one in the map is the"
-         " printed top-right", "4 1 2 3"),
         (jaxlie.SO3.from_z_radians(np.pi), "by 180 deg", "3 4 1 2"),
         (jaxlie.SO3.from_y_radians(np.pi), "the wrong way round", "2 1 4 3"),
-        (jaxlie.SO3.from_x_radians(np.pi), "the wrong way round", "4 3 2 1"),
     ],
 )  # fmt: skip
 def test_corners_in_another_order_are_named(images, turn, words, right):
@@ -144,9 +141,7 @@ SHIFTED = moved(LOW, jaxlie.SE3.from_translation(jnp.array([0.05, 0.0, 0.0])))
     ("markers", "rig"),
     [
         (sized(1, 1.1, 1), RIG),
-        (sized(1.03, 1.03, 1.03), RIG),  # a page that was scaled
         (SHIFTED, RIG),
-        (ROOM, RIG.with_focal_px(319 * 1.02)),
         (ROOM, rig_with("left", jaxlie.SO3.from_y_radians(np.deg2rad(5.0)))),
     ],
 )
@@ -174,14 +169,14 @@ def test_pictures_without_markers_of_another_size_or_shown_twice(images):
     assert "seen twice in one picture: 0 in front" in the_problem(problems, "warning").what
 
 
-@pytest.mark.parametrize(("bent_px", "level"), [(0.0, "ok"), (3.0, "warning")])
-def test_corners_of_curled_paper_are_those_of_no_square(bent_px, level):
+def test_corners_of_curled_paper_are_those_of_no_square():
     markers = alone(ROOM, HIGH)
     seen = observe(RIG, markers, planar(*POSE))
-    corners_px = np.array(seen.corners_px)
-    corners_px[:, :, 0] += bent_px
-    told = CornerLanes(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0, 0)
-    _, (pose,), findings = in_their_order(Sighted(RIG, markers, told), ROUTE)
-    assert findings[-1].level == level
-    assert ("off those of any square" in findings[-1].what) == (level == "warning")
-    assert (pose.error_px < 1e-6) == (level == "ok")
+    for bent_px, level in ((0.0, "ok"), (3.0, "warning")):
+        corners_px = np.array(seen.corners_px)
+        corners_px[:, :, 0] += bent_px
+        told = CornerLanes(corners_px, np.asarray(seen.visible), np.full((4, 1, 4), 0.1), 0, 0, 0)
+        _, (pose,), findings = in_their_order(Sighted(RIG, markers, told), ROUTE)
+        assert findings[-1].level == level
+        assert ("off those of any square" in findings[-1].what) == (level == "warning")
+        assert (pose.error_px < 1e-6) == (level == "ok")

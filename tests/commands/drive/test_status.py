@@ -44,7 +44,7 @@ def test_a_line_reads_as_it_is_meant():
 USUAL = status_line(outcome_of([1.0, 2.0, 3.0], 0.5, True), 30.0, 5.0, True)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     pose=st.tuples(FLOATS, FLOATS, FLOATS),
     flip=FLOATS,

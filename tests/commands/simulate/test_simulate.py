@@ -19,7 +19,6 @@ from jaxnav.sim.rollout import Trace
 from jaxnav.sim.scenarios import on_laps, scenarios
 from jaxnav.sim.scores import Drives
 from jaxnav.sim.statistics import Reliability
-from tests.helpers.strangers import jaxnav
 
 SCENARIO = scenarios()["paper"]
 
@@ -102,19 +101,18 @@ def test_errors_after_twenty_seconds_count_apart():
     assert not any("after_20s" in name for name in Drives.of(drives, SCENARIO).summary())
 
 
-def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path, stranger):
-    """On its own route, and in a process of its own: it chooses the precision."""
+def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path, stranger, capsys):
+    """On its own route."""
     file = tmp_path / "s.json"
     words = ["--seeds", "3", "--selector", "oracle", *stranger.flags(), "--json", str(file)]
-    ended = jaxnav(stranger.folder, "simulate", *words, "--headless")
-    assert (ended.returncode, ended.stderr) == (0, "")
-    row = ended.stdout.splitlines()[-1]
+    assert main(["simulate", *words, "--headless"]) == 0
+    row = capsys.readouterr().out.splitlines()[-1]
     result = json.loads(file.read_text())
     assert result["run"]["selector"] == "oracle"
     assert result["success_rate"]["value"] == 1
     assert row.startswith("| oracle | 1 | 100.0% |")
-    again = jaxnav(stranger.folder, "simulate", *words, "--headless", "--resume")
-    assert again.stdout.splitlines()[-1] == row
+    assert main(["simulate", *words, "--headless", "--resume"]) == 0  # nothing is left to drive
+    assert capsys.readouterr().out.splitlines()[-1] == row
     assert json.loads(file.read_text())["drives"] == 3
 
 
@@ -149,16 +147,15 @@ def test_parameters_drive_and_are_what_a_result_belongs_to(tmp_path, capsys, mon
     assert len(json.loads(file.read_text())["runs"]) == 3
 
 
-@pytest.mark.parametrize("px", [1.0, 2.0])
-def test_the_noise_that_is_told_goes_before_that_of_a_file(px, tmp_path):
+def test_the_noise_that_is_told_goes_before_that_of_a_file(tmp_path):
     write_params(
         tmp_path / "p.yaml",
         {"corner_sigma_px": 3.0, "motion.tilt_sigma_rad": 0.5, "motion.height_sigma_m": 0.25},
     )
     path = tmp_path / "p.yaml"
     car = ScenarioCar.load(Arguments(params=path), load_params(path))
-    found = parameters_of(_navigator(car, SCENARIO, "mahalanobis", px))
-    assert float(found["corner_sigma_px"]) == px
+    found = parameters_of(_navigator(car, SCENARIO, "mahalanobis", 2.0))
+    assert float(found["corner_sigma_px"]) == 2.0
     assert float(found["motion.tilt_sigma_rad"]) == 0.5  # before what the scenario tells
     assert float(found["motion.height_sigma_m"]) == 0.25
 
@@ -197,46 +194,21 @@ def test_laps_are_driven_and_their_later_errors_shown(tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[-1].endswith("| nan |")
 
 
-MEASURED = (
-    "success_rate",
-    "wrong_branch_fraction_after_2s",
-    "wrong_once_decided_fraction",
-    "median_position_error_m",
-    "anees",
-)
-
-
-def kept(tmp_path, capsys, change=lambda result: None) -> tuple[int, str, str]:
-    """Resume what is all there, of drives that never decided: their numbers are missing."""
-    run = {
-        "scenario": "paper",
-        "selector": "oracle",
-        "corner_noise_px": 1.0,
-        "told_noise_px": 1.0,
-        "seeds": [0, 2],
-        "rig": None,
-        "markers": None,
-        "vehicle": None,
-    }
-    missing = {"value": None}
-    result = {"run": run, "time_to_decide_s": {"median": missing, "p95": missing}}
-    result |= dict.fromkeys(MEASURED, missing)
-    change(result)
-    (tmp_path / "s.json").write_text(json.dumps({"runs": [result]}))
-    arguments = ["--seeds", "3", "--selector", "oracle", "--resume", "--headless"]
-    code = main(["simulate", *arguments, "--json", str(tmp_path / "s.json")])
-    told = capsys.readouterr()
-    return code, told.out, told.err
+MISSING = {"value": None}  # of drives that never decided
+MEASURED = dict.fromkeys(
+    (
+        "success_rate",
+        "wrong_branch_fraction_after_2s",
+        "wrong_once_decided_fraction",
+        "median_position_error_m",
+        "anees",
+    ),
+    MISSING,
+) | {"time_to_decide_s": {"median": MISSING, "p95": MISSING}}
 
 
 def test_all_selectors_have_a_row_and_a_name_on_the_command_line(capsys, monkeypatch):
-    def drive(_args, _car, _scenario, key: dict) -> dict:
-        missing = {"value": None}
-        return dict.fromkeys(MEASURED, missing) | {
-            "time_to_decide_s": {"median": missing, "p95": missing}
-        }
-
-    monkeypatch.setattr("jaxnav.commands.simulate.simulate._drive", drive)
+    monkeypatch.setattr("jaxnav.commands.simulate.simulate._drive", lambda *_: MEASURED)
     assert main(["simulate", "--selector", "all", "--headless"]) == 0
     rows = [line.split(" | ")[0].strip("| ") for line in capsys.readouterr().out.splitlines()[2:]]
     assert rows == list(SELECTORS)
@@ -246,48 +218,39 @@ def test_all_selectors_have_a_row_and_a_name_on_the_command_line(capsys, monkeyp
     assert {*get_args(Scenario)} == {*scenarios()}
 
 
-def test_what_is_missing_is_kept_and_what_lacks_something_not_resumed(tmp_path, capsys):
-    code, out, _ = kept(tmp_path, capsys)
-    assert code == 0
-    assert out.splitlines()[-1] == "| oracle | 1 | nan% | nan% | nan / nan | nan% | nan | nan |"
-    for change, told in (
-        (lambda result: result.pop("anees"), "anees: missing"),
-        (
-            lambda result: result.update(anees={"value": "3"}),
-            "anees.value: must be a number, got the text '3'",
-        ),
-    ):
-        code, _, err = kept(tmp_path, capsys, change)
-        assert (code, err.count("\n")) == (2, 1)
-        assert f"s.json: runs[0].{told}" in err
-
-
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("change", "line"),
     [
-        (["simulate", "--corner-noise-px", "-1"], "--corner-noise-px"),
-        (["simulate", "--resume"], "--resume"),
-        (["simulate", "--laps", "101"], "--laps"),
-        (["simulate", "--laps", "1", "--route", "r.yaml"], "--laps: takes the place of --route"),
-        (["simulate", "--laps", "1", "--scenario", "static"], "--laps: nothing drives in static"),
-        (["simulate", "--markers", "nowhere.yaml"], "nowhere.yaml"),
-        (["simulate", "--base", "omni", "--vehicle", "v.yaml"], "--base: omni takes the place of"),
-        (["simulate", "--scenario", "gyro-late"], "--scenario: gyro-late turns on the spot"),
-        (["simulate", "--params", "nowhere.yaml"], "nowhere.yaml"),
-        (["reliability", "nowhere.bag"], "nowhere.bag"),
+        ({}, None),
+        ({"anees": None}, "anees: missing"),
+        ({"anees": {"value": "3"}}, "anees.value: must be a number, got the text '3'"),
     ],
 )
-def test_bad_input_is_one_line(arguments, told, capsys):
-    assert main([*arguments, *(["--headless"] if "--resume" not in arguments else [])]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert told in lines[0]
+def test_what_is_missing_is_kept_and_what_lacks_something_not_resumed(
+    tmp_path, capsys, change, line
+):
+    run = {"scenario": "paper", "selector": "oracle", "seeds": [0, 2]}
+    run |= dict.fromkeys(("corner_noise_px", "told_noise_px"), 1.0)
+    run |= dict.fromkeys(("rig", "markers", "vehicle"))
+    result = {"run": run} | MEASURED | change
+    result = {name: value for name, value in result.items() if value is not None}
+    (tmp_path / "s.json").write_text(json.dumps({"runs": [result]}))
+    arguments = ["--seeds", "3", "--selector", "oracle", "--resume", "--headless"]
+    code = main(["simulate", *arguments, "--json", str(tmp_path / "s.json")])
+    out, err = capsys.readouterr()
+    if line is None:
+        assert code == 0
+        row = "| oracle | 1 | nan% | nan% | nan / nan | nan% | nan | nan |"
+        assert out.splitlines()[-1] == row
+    else:
+        assert (code, err.count("\n")) == (2, 1)
+        assert f"s.json: runs[0].{line}" in err
 
 
 def test_random_views_are_drawn(tmp_path, capsys):
-    assert main(["reliability", "--frames", "400", "--headless", "--out", str(tmp_path)]) == 0
+    assert main(["reliability", "--frames", "200", "--headless", "--out", str(tmp_path)]) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert 150 < summary["pairs"] < 350
-    assert 0.02 < summary["flipped_fraction"] < 0.25
-    assert summary["expected_calibration_error"] < 0.15
+    assert 75 < summary["pairs"] < 175
+    assert 0.01 < summary["flipped_fraction"] < 0.3
+    assert summary["expected_calibration_error"] < 0.2
     assert (tmp_path / "reliability.png").stat().st_size > 5000

@@ -14,41 +14,7 @@ from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.experiments.tuning.drive_loss import DriveLoss
 from jaxnav.files import load_params
 
-
-def told(capsys, *arguments: str) -> str:
-    """The one line that bad input gets."""
-    assert main(["tune", *arguments, "--headless"]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1
-    return err
-
-
 FEW = ("--seeds", "2", "--held-out-seeds", "1", "--test-seeds", "2")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (("filter", "--seed", "-1"), "--seed: must be at least 0"),
-        (("filter", "--part", "0.5", "0.5"), "--part: must be two parts"),
-        (("filter", "--corner-noise-px", "nan"), "--corner-noise-px: must be from 0.001 to 100 px"),
-        (("filter", "nowhere.mcap"), "nowhere.mcap: "),
-        (("filter", "drive.mcap", "--imu", "consumer"), "--imu: is of simulated drives"),
-        (("filter", "drive.mcap", "--route", "r.yaml"), "--route: is of simulated drives"),
-        (("controller", "--base", "omni", "--vehicle", "v.yaml"), "--base: omni takes the place"),
-        (("filter", "--params", "nowhere.yaml"), "nowhere.yaml: "),
-        (("controller", "--learning-rate", "inf"), "--learning-rate: must be finite"),
-        (("controller", "--test-scenario", "static"), "--scenario: nothing drives in static"),
-        (("controller", "--train", "controller.fame"), "--train: there is no controller.fame"),
-        (
-            ("controller", *(f"--{name}=0" for name in ("time", "cross-track", "effort")),
-             "--smoothness=0"),
-            "nothing to lower",
-        ),
-    ],
-)  # fmt: skip
-def test_bad_input_gets_one_line(capsys, arguments, says):
-    assert says in told(capsys, *arguments)
 
 
 def test_the_command_weighs_as_the_loss_does_by_default():
@@ -73,7 +39,7 @@ def test_a_base_has_gains_and_noise_of_its_own():
 
 @pytest.mark.long
 @pytest.mark.parametrize("stranger", ["crawler"], indirect=True)
-def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch, stranger):
+def test_a_filter_is_tuned_and_the_result_taken(capsys, refusal, tmp_path, monkeypatch, stranger):
     """A better loss on what was held out; the same command has nothing left to do, another one is
     refused, and so are parameters that nothing can be learned about."""
     # A driver and a selector without a bank compile in a fifth of the time.
@@ -105,8 +71,9 @@ def test_a_filter_is_tuned_and_the_result_taken(capsys, tmp_path, monkeypatch, s
     assert (out / "params.yaml").read_bytes() == kept
     assert main([*command, "--seed", "5"]) == 2
     assert "is of another run, whose seed is 0 and not 5" in capsys.readouterr().err
+    begins = ("tune", "filter", *few, "--headless", "--out", tmp_path / "other")
     for name in ("motion.fame", "motion.gate_nis", "controller.lookahead_m", "selector.floor_m"):
-        line = told(capsys, "filter", *few, "--train", name, "--out", str(tmp_path / "other"))
+        line = refusal(*begins, "--train", name)
         assert f"--train: there is no {name} to learn in this filter: expected one of" in line
-    line = told(capsys, "filter", *few, "--full", "corner_sigma_px", "--out", str(tmp_path / "o"))
+    line = refusal(*begins, "--full", "corner_sigma_px")
     assert "--full: corner_sigma_px: is no covariance" in line

@@ -37,11 +37,6 @@ def test_7(data_dir) -> Recording:
     return read_recording(data_dir / "tagslam" / "test_7" / "decoded.npz")
 
 
-@pytest.fixture(scope="module")
-def corner_sigma_px() -> float:
-    return 0.18
-
-
 def places(recording: Recording) -> dict[bytes, tuple[int, int, int]]:
     """Corners -> frame, camera and marker of the detection."""
     found = np.argwhere(recording.visible)
@@ -82,7 +77,9 @@ def long_enough(recording: Recording, begin: int, end: int, shortest: int) -> se
     return kept
 
 
-@pytest.mark.parametrize("part", [*HALVES, (0.25, 0.7)])
+@pytest.mark.parametrize(
+    "part", [(0.25, 0.7), *(pytest.param(half, marks=pytest.mark.long) for half in HALVES)]
+)
 def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
     recorded = jax.device_get(sequences_of_recording(test_7, part))
     place_of = places(test_7)
@@ -119,14 +116,6 @@ def test_every_detection_is_in_one_appearance_of_its_marker(test_7, part):
     assert np.all(np.isfinite(recorded.obs.corners_px))
 
 
-def test_parts_that_adjoin_share_no_frame(test_7):
-    place_of, frames = places(test_7), []
-    for part in HALVES:
-        found = detections(sequences_of_recording(test_7, part))
-        frames.append({place_of[corners][0] for row in found for _, corners in row})
-    assert max(frames[0]) < round(len(test_7) / 2) <= min(frames[1])
-
-
 def test_a_frame_without_a_reference_is_not_judged(test_7):
     valid = np.zeros(len(test_7), bool)
     known = test_7.reference._replace(valid=valid)
@@ -145,11 +134,11 @@ def test_too_short_a_recording_says_what_is_needed(test_7):
 
 
 @pytest.mark.long
-def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
+def test_the_branch_that_is_chosen_is_the_true_one(test_7):
     recorded = sequences_of_recording(test_7, (0, 1), length=12, shortest=6)
     rows = np.linspace(0, len(recorded) - 1, 20).astype(int)
     recorded = recorded.rows(rows)
-    navigator = navigator_of(test_7, "multi-hypothesis", corner_sigma_px)
+    navigator = navigator_of(test_7, "multi-hypothesis", 0.18)
     start = find_starts(navigator, recorded)
     assert start.chosen.mean() >= 0.95
     first = jnp.argmax(estimate_sequences(navigator, recorded).decided, axis=1)
@@ -160,8 +149,8 @@ def test_the_branch_that_is_chosen_is_the_true_one(test_7, corner_sigma_px):
     assert np.mean(np.rad2deg(off_rad)[np.asarray(start.chosen)] < 10) >= 0.95
 
 
-def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_px):
-    navigator = navigator_of(test_7, "multi-hypothesis", corner_sigma_px)
+def test_recordings_are_put_together_padded_to_the_longest(test_7):
+    navigator = navigator_of(test_7, "multi-hypothesis", 0.18)
     parts = [
         sequences_of_recording(test_7, HALVES[0], 20),
         sequences_of_recording(test_7, HALVES[1], 32),
@@ -183,9 +172,9 @@ def test_recordings_are_put_together_padded_to_the_longest(test_7, corner_sigma_
         assert not some.obs.dt_s[:, length:].any()
 
 
-def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
+def test_recordings_that_do_not_go_together_are_named(test_7):
     alone = sequences_of_recording(test_7, (0, 1))
-    navigator = navigator_of(test_7, "multi-hypothesis", corner_sigma_px)
+    navigator = navigator_of(test_7, "multi-hypothesis", 0.18)
     one = NamedSequences("one", navigator, alone)
     visible = alone.obs.visible
     for what, counts, changed in (
@@ -199,7 +188,7 @@ def test_recordings_that_do_not_go_together_are_named(test_7, corner_sigma_px):
         test_7.rig,
         Ts_camera_vehicle=jaxlie.SE3(test_7.rig.Ts_camera_vehicle.wxyz_xyz.at[0, 4].add(1e-3)),
     )
-    moved = navigator_of(dataclasses.replace(test_7, rig=rig), "multi-hypothesis", corner_sigma_px)
+    moved = navigator_of(dataclasses.replace(test_7, rig=rig), "multi-hypothesis", 0.18)
     with pytest.raises(BadInput, match=r"^one, other: must have the same rig"):
         join_sequences([one, NamedSequences("other", moved, alone)])
 
