@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.core.linalg.levenberg_marquardt import LMState
-from jaxnav.core.linalg.schur import Blocks, SchurLM, reduce
+from jaxnav.core.linalg.schur import Blocks, SchurLM
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import cayley, rotation_matrix, skew, turn_and_shift
 from jaxnav.core.models.lenses import LENSES, MOST_COEFFICIENTS
@@ -54,7 +54,6 @@ class Bundle(eqx.Module):
 
     unknowns: LensUnknowns
     residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 for points not seen
-    blocks: Blocks  # in pixels, weighted as in the fit
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
@@ -119,6 +118,7 @@ def padded(
     return seen, LensUnknowns(jnp.asarray(parameters), jnp.asarray(poses))
 
 
+@partial(jax.jit, static_argnames="lens")
 def solve(
     lens: str,
     start: LensUnknowns,
@@ -138,23 +138,8 @@ def solve(
         free: mask of the nine shared unknowns that move.
         cut: in sigmas; `NO_CUT` for plain least squares.
     """
-    numbers = jnp.asarray(weights, float), jnp.asarray(free)
-    scalars = jnp.asarray(sigma_px), jnp.asarray(cut)
-    return jax.block_until_ready(_solved(lens, start, seen, *numbers, *scalars))
-
-
-@partial(jax.jit, static_argnames="lens")
-def _solved(
-    lens: str,
-    start: LensUnknowns,
-    seen: BoardCorners,
-    weights: Array,
-    free: Array,
-    sigma_px: Array,
-    cut: Array,
-) -> Bundle:
-    weights = jnp.where(seen.present, weights, 0)
-    scale = jnp.sqrt(weights) / sigma_px
+    scale = jnp.sqrt(jnp.where(seen.present, weights, 0.0)) / sigma_px
+    free = jnp.asarray(free)
 
     def fn(y: LensUnknowns, args: Any) -> Any:
         residual_px, of_lens, of_pose = linearised(lens, y, seen)
@@ -174,21 +159,12 @@ def _solved(
         throw=False,
     )
     state: LMState = solution.state
-    residual_px = _predicted(lens, solution.value, seen) - seen.corners_px
-    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.normal)
     return Bundle(
         unknowns=solution.value,
-        residual_px=jnp.where(seen.present[..., None], residual_px, 0),
-        blocks=blocks,
+        residual_px=residuals_px(lens, solution.value, seen),
         steps=state.steps,
         converged=state.done,
     )
-
-
-@jax.jit
-def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9 9"]:
-    """Information of the nine, poses eliminated, for 1 px of noise; identity for fixed ones."""
-    return reduce(blocks, free, jnp.zeros(())).system
 
 
 @partial(jax.jit, static_argnames="lens")
@@ -215,20 +191,16 @@ def view_information(
 @partial(jax.jit, static_argnames="lens")
 def residuals_px(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "V P 2"]:
     """Residuals, predicted - seen; 0 for points not seen."""
-    return jnp.where(seen.present[..., None], _predicted(lens, y, seen) - seen.corners_px, 0)
-
-
-def _predicted(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "V P 2"]:
     camera = camera_of(lens, y.lens)
-    points_board_m = jnp.asarray(seen.points_board_m)
 
     def view(wxyz_xyz: Array) -> Array:
         T_camera_board = jaxlie.SE3(wxyz_xyz)
         R_camera_board = rotation_matrix(T_camera_board.rotation())
         t_m = T_camera_board.translation()
-        return camera.project(turn_and_shift(R_camera_board, t_m, points_board_m))
+        return camera.project(turn_and_shift(R_camera_board, t_m, jnp.asarray(seen.points_board_m)))
 
-    return jax.vmap(view)(y.Ts_camera_board)
+    residual_px = jax.vmap(view)(y.Ts_camera_board) - seen.corners_px
+    return jnp.where(seen.present[..., None], residual_px, 0)
 
 
 def linearised(

@@ -125,7 +125,7 @@ def rim_sigma_px(fit: LensFit) -> float:
     w, h = np.array(fit.views.image_size_px) - 1.0
     part = np.linspace(0, 1, _RIM_POINTS)
     pixels = np.concatenate([[[w * p, 0], [w * p, h], [0, h * p], [w, h * p]] for p in part])
-    J, _, drawn = ray_slopes(fit.lens, fit.parameters, pixels)
+    J, _, drawn = jax.device_get(ray_slopes(fit.lens, fit.parameters, pixels))
     if not np.all(drawn):
         return np.inf
     radial = np.array([name[0] not in "cp" for name in fit.names], float)
@@ -170,13 +170,11 @@ def cells(fit: LensFit) -> Cells:
     wide, high = _CELLS_WIDE, max(2, round(_CELLS_WIDE * height / width))
     at = (fit.used_px + 0.5) / [width, height] * [wide, high]
     column, row = np.clip(at, 0, [wide - 1, high - 1]).astype(int).T
-    weights = fit.weights[fit.used]
-    counts, totals = np.zeros((high, wide), int), np.zeros((high, wide))
-    sums = np.zeros((high, wide, 2))
-    np.add.at(counts, (row, column), 1)
-    np.add.at(totals, (row, column), weights)
-    np.add.at(sums, (row, column), weights[:, None] * fit.residual_px[fit.used])
-    mean_px = sums / np.maximum(totals, 1e-12)[..., None]
+    residuals = np.column_stack([np.ones(len(at)), fit.residual_px[fit.used]])
+    sums = np.zeros((high, wide, 3))
+    np.add.at(sums, (row, column), fit.weights[fit.used][:, None] * residuals)
+    counts = np.histogram2d(row, column, (range(high + 1), range(wide + 1)))[0].astype(int)
+    totals, mean_px = sums[..., 0], sums[..., 1:] / np.maximum(sums[..., :1], 1e-12)
     # A mean of total weight W has the variance sigma^2 / W in x and in y.
     filled = counts > 0
     squared = np.sum(mean_px[filled] ** 2, axis=-1)

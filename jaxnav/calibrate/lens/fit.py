@@ -121,7 +121,7 @@ def fit_lens(
     seen, y = lens_bundle.padded(views, parameters, poses)
     problem = _Problem(lens, seen, free, np.pad(posed, (0, len(seen.corners_px) - count)))
 
-    weights = problem.posed[:, None] * seen.present
+    weights = np.where(problem.posed[:, None], seen.present, 0.0)
     sigma_px = problem.typical_px(np.asarray(lens_bundle.residuals_px(lens, y, seen)))
     for _ in range(_ROBUST_ROUNDS):
         bundle = problem.solved(y, weights, sigma_px, _CUT)
@@ -237,28 +237,24 @@ class _Problem:
     ) -> tuple[float, np.ndarray]:
         """The factor of the variances by which the views disagree, 1 where there are too few; and
         the covariance (9, 9), zero for fixed parameters, infinite if the views tell nothing."""
-        information, gradient = lens_bundle.view_information(
-            self.lens, bundle.unknowns, self.seen, jnp.asarray(weights)
+        information, gradient = map(
+            np.asarray, lens_bundle.view_information(self.lens, bundle.unknowns, self.seen, weights)
         )
         shown = np.any(weights > 0, axis=1)
-        each = np.asarray(information)[shown][:, self.free][:, :, self.free]
-        scores = np.asarray(gradient)[shown][:, self.free] / sigma_px
+        each = information[shown][:, self.free][:, :, self.free]
         scale = 1 / np.sqrt(np.maximum(np.einsum("bii->i", each), 1e-300))
+        each, scores = each * np.outer(scale, scale), gradient[shown][:, self.free] * scale
+        factor, inverse = 1.0, np.full_like(np.outer(scale, scale), np.inf)
         try:
-            factor = _leveraged_inflation(each * np.outer(scale, scale), scores * scale)
+            inverse = np.linalg.inv(each.sum(axis=0))
+            factor = _leveraged_inflation(each, scores / sigma_px)
         except np.linalg.LinAlgError:  # the views don't tell all of them
-            factor = 1.0
-        inside = np.ix_(self.free, self.free)
-        total = np.asarray(lens_bundle.lens_information(bundle.blocks, jnp.asarray(self.free)))
-        scale = 1 / np.sqrt(np.maximum(np.diag(total[inside]), 1e-300))
+            pass
+        if not np.all(np.diag(inverse) > 0):
+            inverse[:] = np.inf
         covariance = np.zeros((COUNT, COUNT))
-        try:
-            inverse = np.linalg.inv(total[inside] * np.outer(scale, scale))
-            covariance[inside] = factor * sigma_px**2 * inverse * np.outer(scale, scale)
-        except np.linalg.LinAlgError:
-            covariance[inside] = np.inf
-        if not np.all(np.diag(covariance[inside]) > 0):
-            covariance[inside] = np.inf
+        inside = np.ix_(self.free, self.free)
+        covariance[inside] = factor * sigma_px**2 * inverse * np.outer(scale, scale)
         return factor, covariance
 
 

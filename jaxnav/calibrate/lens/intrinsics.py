@@ -178,7 +178,7 @@ def calibrate_lens(
         best = choice.best_lens(fits, errors, drawn)
     stage("check")
     _require_sound(fits[best], where)
-    better = min(errors, key=lambda one: errors[one].rms_px, default=best)
+    better = min(errors, key=lambda one: choice.rms(errors[one]), default=best)
     if better != best and not choice.clearly_better(errors[better], errors[best]):
         better = best
     fit = _undetermined_held(fits[best], stage)
@@ -193,7 +193,7 @@ def calibrate_lens(
             )
     return LensCalibration(
         fit=fit,
-        held_out_px={one: error.rms_px for one, error in errors.items()},
+        held_out_px={one: choice.rms(error) for one, error in errors.items()},
         given=len(views.views),
         left_out=left_out,
         downweighted={
@@ -254,7 +254,7 @@ def _undetermined_held(fit: LensFit, stage: Stage) -> LensFit:
         stage(f"hold {name}")
         held = fit_lens(fit.views, fit.lens, (*fit.fixed, name), fit.parameters)
         weights = fit.weights * held.weights
-        before, after = (choice.held_out(one, weights).rms_px for one in (fit, held))
+        before, after = (choice.rms(choice.held_out_px(one, weights)) for one in (fit, held))
         if not after < _GROWN * before:
             break
         fit = held

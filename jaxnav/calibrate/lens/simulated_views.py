@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibrate.board.views import BoardView, BoardViews
+from jaxnav.calibrate.board.views import BoardView, BoardViews, unproject
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import transform_points
 
-_unprojected = jax.jit(Camera.unproject)
 _FACING = np.diag([1.0, -1.0, -1.0])  # R_camera_board of a board that hangs upright, seen head-on
 
 
@@ -50,7 +49,7 @@ def simulated_views(
     poses: list[np.ndarray] = []
     while len(views) < count:
         middle_px = size / 2 + reach * rng.uniform(-0.5, 0.5, 2) * size
-        sight = np.asarray(_unprojected(camera, jnp.asarray(middle_px)))
+        sight = np.asarray(unproject(camera, jnp.asarray(middle_px)))
         R_camera_board = _orientation(sight, most_tilt_deg, rng)
         wxyz = np.roll(Rotation.from_matrix(R_camera_board).as_quat(), 1)
         pose = np.concatenate([wxyz, sight * rng.uniform(*distances_m)])

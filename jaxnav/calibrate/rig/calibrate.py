@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxnav.calibrate.parts import variance_inflation
 from jaxnav.calibrate.rig import bundle
 from jaxnav.calibrate.rig.linking import Linker, Links
 from jaxnav.calibrate.rig.views import (
@@ -25,6 +24,7 @@ from jaxnav.calibrate.rig.views import (
     rays_camera,
     wxyz_xyz,
 )
+from jaxnav.calibrate.robust import variance_inflation
 from jaxnav.core.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
@@ -241,8 +241,7 @@ def _other_branches(
     known = bundle.seen(rig, views, sigma_px)
 
     def cost(of: bundle.RigUnknowns, groups: np.ndarray, count: int) -> np.ndarray:
-        residuals = np.asarray(bundle.reprojection_residuals_px(of, known))
-        return np.bincount(groups, bundle.losses(residuals, float(known.sigma_px)), count)
+        return np.bincount(groups, bundle.costs(of, known), count)
 
     def best_of(
         of: bundle.RigUnknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]

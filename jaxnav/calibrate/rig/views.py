@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.models.camera import Camera
+from jaxnav.calibrate.board.views import unproject
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.refine import solve_markers
@@ -62,9 +62,7 @@ def rays_camera(rig: CameraRig, views: RigViews) -> Float[np.ndarray, "N 4 3"]:
     rays = np.zeros((len(views), 4, 3))
     for index in range(len(rig)):
         seen = views.camera == index
-        camera = rig.camera(index)
-        unprojected = partial(_unprojected, camera)
-        rays[seen] = _in_batches(unprojected, views.corners_px[seen])
+        rays[seen] = _in_batches(partial(unproject, rig.camera(index)), views.corners_px[seen])
     return rays
 
 
@@ -84,11 +82,6 @@ def both_poses(
     T = _in_batches(_solved, corners_n, size_m)
     T[:, :, :3] = np.einsum("nij,nbjk->nbik", R_camera_straight, T[:, :, :3])
     return T
-
-
-@jax.jit
-def _unprojected(camera: Camera, corners_px: Float[Array, "N 4 2"]) -> Float[Array, "N 4 3"]:
-    return camera.unproject(corners_px)
 
 
 @jax.jit
