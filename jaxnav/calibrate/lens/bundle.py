@@ -1,7 +1,7 @@
 """Bundle adjustment of one camera and all its views of a board.
 
 The unknowns are the lens, nine numbers that all views share, and the pose of the board in every
-view. The poses are eliminated (`core.linalg.schur`), so time and memory grow linearly with the
+view. The poses are eliminated (`calibrate.schur`), so time and memory grow linearly with the
 number of views. The frame is the board's, so there is no gauge to fix.
 """
 
@@ -17,8 +17,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxnav.calibrate.board.views import BoardViews
+from jaxnav.calibrate.schur import Blocks, SchurLM
 from jaxnav.core.linalg.levenberg_marquardt import LMState
-from jaxnav.core.linalg.schur import Blocks, SchurLM
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import cayley, rotation_matrix, skew, turn_and_shift
 from jaxnav.core.models.lenses import LENSES, MOST_COEFFICIENTS
@@ -146,7 +146,7 @@ def solve(
         squared = jnp.sum(residual_px**2, axis=-1) * scale**2
         cost = cut**2 * jnp.log1p(squared / cut**2)
         counts = scale / jnp.sqrt(1 + squared / cut**2)
-        return jnp.sqrt(cost).reshape(-1), normal_equations(residual_px, of_lens, of_pose, counts)
+        return jnp.sqrt(cost).reshape(-1), _normal_equations(residual_px, of_lens, of_pose, counts)
 
     solution: optx.Solution = optx.least_squares(
         fn,
@@ -175,11 +175,19 @@ def view_information(
 
     Also the gradient of half the cost of each view by the nine.
     """
-    residual_px, of_lens, of_pose = linearised(lens, y, seen)
-    root = jnp.sqrt(jnp.where(seen.present, weights, 0))[..., None, None]
-    A, B = (
-        (root * J).reshape(J.shape[0], -1, J.shape[-1]) for J in (of_lens, of_pose)
-    )  # (V, 2P, 9), (V, 2P, 6)
+    return without_poses(*linearised(lens, y, seen), jnp.where(seen.present, weights, 0))
+
+
+def without_poses(
+    residual_px: Float[Array, "V P 2"],
+    of_shared: Float[Array, "V P 2 R"],
+    of_pose: Float[Array, "V P 2 6"],
+    weights: Float[Array, "V P"],
+) -> tuple[Float[Array, "V R R"], Float[Array, "V R"]]:
+    """Information of shared unknowns from each view and gradient, its pose eliminated."""
+    root = jnp.sqrt(weights)[..., None, None]
+    # (V, 2P, R), (V, 2P, 6)
+    A, B = ((root * J).reshape(J.shape[0], -1, J.shape[-1]) for J in (of_shared, of_pose))
     r = (root[..., 0] * residual_px).reshape(A.shape[0], -1, 1)
     length = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
     Q, _ = jnp.linalg.qr(B / jnp.where(length > 0, length, 1))
@@ -230,7 +238,7 @@ def linearised(
     return projected - seen.corners_px, of_lens, of_pose
 
 
-def normal_equations(
+def _normal_equations(
     residual_px: Float[Array, "V P 2"],
     of_lens: Float[Array, "V P 2 R"],
     of_pose: Float[Array, "V P 2 6"],

@@ -19,7 +19,6 @@ from jaxnav.calibrate.lens import choice
 from jaxnav.calibrate.lens.checks import advice, findings, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibrate.lens.fit import LensFit, fit_lens
 from jaxnav.calibrate.lens.start import lens_start
-from jaxnav.core.models.camera import Camera
 from jaxnav.errors import BadInput
 
 _FEWEST_VIEWS = 5
@@ -58,10 +57,6 @@ _STAYS = 0.1  # in sigmas, of every parameter
 Stage = Callable[[str], None]  # called with a word for every stage
 
 
-def _silent(stage: str) -> None:
-    """Show no progress."""
-
-
 @dataclass(frozen=True)
 class LensCalibration:
     """A calibrated lens with its checks, its left-out views and advice."""
@@ -77,18 +72,13 @@ class LensCalibration:
     findings: tuple[str, ...]  # lines about what is wrong or was held at zero
     advice: tuple[str, ...]  # lines about what to collect next
 
-    @property
-    def camera(self) -> Camera:
-        """The calibrated camera, in the process's precision."""
-        return self.fit.camera
-
 
 def calibrate_images(
     board: Board,
     sources: Sequence[Path],
     lens: str = "auto",
     max_views: int = 100,
-    stage: Stage = _silent,
+    stage: Stage = lambda _: None,
     bar: Bar = lambda items, **_: items,
 ) -> tuple[CollectedViews, LensCalibration]:
     """Collect the views of the board from images, and calibrate the lens from them.
@@ -122,10 +112,10 @@ def calibrate_images(
             if np.all(np.abs(last.parameters - before.parameters) <= _STAYS * before.sigma):
                 break
     collected = collect_views(board, sources, before.camera if before else None, bar=bar)
-    gone = {name: f"the same picture as {twin}" for name, twin in collected.duplicates}
-    gone |= dict(collected.unreadable)
-    gone |= dict.fromkeys(collected.without_board, "the board is not seen")
-    return collected, calibrate_lens(collected.views, lens, max_views, where, stage, gone)
+    unusable = {name: f"the same picture as {twin}" for name, twin in collected.duplicates}
+    unusable |= dict(collected.unreadable)
+    unusable |= dict.fromkeys(collected.without_board, "the board is not seen")
+    return collected, calibrate_lens(collected.views, lens, max_views, where, stage, unusable)
 
 
 def calibrate_lens(
@@ -133,8 +123,8 @@ def calibrate_lens(
     lens: str = "auto",
     max_views: int = 100,
     where: str = "the views",
-    stage: Stage = _silent,
-    gone: Mapping[str, str] = MappingProxyType({}),
+    stage: Stage = lambda _: None,
+    unusable: Mapping[str, str] = MappingProxyType({}),
 ) -> LensCalibration:
     """Calibrate the lens that explains the views best.
 
@@ -143,13 +133,13 @@ def calibrate_lens(
         max_views: the most views to fit; those that tell most are taken.
         where: the source of the views as the user gave it, for messages.
         stage: called with a word for every stage.
-        gone: image -> why it gave no view, for messages.
+        unusable: image -> why it gave no view, for messages.
 
     Raises:
         BadInput: the views don't determine focal length or centre, or show another board.
     """
     good, left_out = screened(views)
-    _require_views(good, {**left_out, **gone}, where)
+    _require_views(good, {**left_out, **unusable}, where)
     lenses = lens_bundle.TRIED if lens == "auto" else (lens,)
     stage("start")
     starts = {one: lens_start(good, one) for one in lenses}
@@ -183,8 +173,11 @@ def calibrate_lens(
         better = best
     fit = _undetermined_held(fits[best], stage)
     _require_observed(fit, better, where)
+    downweighted: dict[str, float] = {}
     for view, weight, sigma_px in zip(good.views, fit.view_weights, fit.view_sigma_px, strict=True):
-        if weight == 0:
+        if 0 < weight < 1:
+            downweighted[view.name] = float(weight)
+        elif weight == 0:
             left_out[view.name] = (
                 f"its corners are {sigma_px:.2g} px off, {sigma_px / fit.sigma_px:.0f} times as "
                 "far as the others': did the board bend, or move?"
@@ -196,11 +189,7 @@ def calibrate_lens(
         held_out_px={one: choice.rms(error) for one, error in errors.items()},
         given=len(views.views),
         left_out=left_out,
-        downweighted={
-            view.name: float(weight)
-            for view, weight in zip(good.views, fit.view_weights, strict=True)
-            if 0 < weight < 1
-        },
+        downweighted=downweighted,
         findings=findings(fit, better),
         advice=advice(fit),
     )

@@ -15,7 +15,7 @@ from scipy import stats
 from jaxnav.calibrate.lens.bundle import retracted
 from jaxnav.calibrate.rig.views import RigViews
 from jaxnav.calibrate.robust import sighting_cost, sighting_weight
-from jaxnav.core.linalg.schur import Blocks, ReducedSystem, SchurLM, reduce
+from jaxnav.calibrate.schur import Blocks, ReducedSystem, SchurLM, reduce
 from jaxnav.core.linalg.small_matrices import cho_solve, cholesky, solve_upper
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import rotation_matrix, skew

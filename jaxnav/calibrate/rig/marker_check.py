@@ -72,7 +72,7 @@ def checked(
     """
     C = len(rig)
     linked = [index for index in given if calibration.mapped[index]]
-    T_map_world, agree = _laid_over(
+    T_map_world, agree = _aligned(
         np.stack([given[index] for index in linked]),
         calibration.Ts_world_marker[linked],
         calibration.views.size_m[linked],
@@ -110,7 +110,7 @@ def sizes_m(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> dic
     return {index: size for index, size in sizes.items() if size is not None}
 
 
-def _laid_over(
+def _aligned(
     given: np.ndarray,
     Ts_world_marker: np.ndarray,
     size_m: np.ndarray,

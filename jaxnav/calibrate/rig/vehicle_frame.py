@@ -113,18 +113,6 @@ def _moved(
     )
 
 
-def moved_world(calibration: RigCalibration, move: Float[np.ndarray, "4 4"]) -> RigCalibration:
-    """Express a calibration in another world, in which `move` is the pose of the present one.
-
-    Covariances stay, as twists are body-fixed.
-    """
-    return replace(
-        calibration,
-        Ts_world_marker=move @ calibration.Ts_world_marker,
-        Ts_world_vehicle=move @ calibration.Ts_world_vehicle,
-    )
-
-
 def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     """(6, 6) A in T exp(xi) = exp(A xi) T, twists ordered (translation, rotation)."""
     R, t = T[:3, :3], T[:3, 3]
@@ -283,7 +271,7 @@ def _fitted(*pairs: Array) -> tuple[np.ndarray, np.ndarray]:
                 lambda *at: np.asarray(_misfits(*at)[1]),
                 x_scale="jac",
                 **dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12),
-                max_nfev=100,
+                max_nfev=40,
                 args=(sigma, *pairs),
             )
             x, apart = found.x, np.asarray(_apart(found.x, *pairs))

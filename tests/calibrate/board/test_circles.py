@@ -58,17 +58,16 @@ def off_px(board: Board, found_px: np.ndarray, T_camera_board: np.ndarray) -> np
 def test_centres_are_found_through_a_lens(kind: str, pose: int) -> None:
     board = BOARDS[kind]
     image = renderer(kind).render(POSES[pose], np.random.default_rng(pose))
-    view = look_at(board, image, "here", CAMERA).view
-    centroids = look_at(board, image, "here").view
-    assert view is not None
-    assert centroids is not None
+    view, centroids, light = (
+        look_at(board, picture, "here", camera).view
+        for picture, camera in ((image, CAMERA), (image, None), (255 - image, CAMERA))
+    )
+    assert None not in (view, centroids, light)
     assert len(view.ids) == len(board.points_board_m)
     error_px = off_px(board, view.corners_px, POSES[pose])
     assert np.sqrt(np.mean(error_px**2)) < 0.015
     # A disc's centroid is not its centre.
     assert np.sqrt(np.mean(off_px(board, centroids.corners_px, POSES[pose]) ** 2)) > 0.08
-    light = look_at(board, 255 - image, "here", CAMERA).view
-    assert light is not None
     assert np.sqrt(np.mean(off_px(board, light.corners_px, POSES[pose]) ** 2)) < 0.015
 
 

@@ -150,7 +150,7 @@ def test_a_wide_lens_of_another_kind_is_fitted_where_it_is_asked_for(lens) -> No
     assert rim_sigma_px(fit) < 0.5
 
 
-def test_a_lens_that_does_not_fit_is_said_to() -> None:
+def test_a_lens_that_does_not_fit_is_named() -> None:
     with pytest.raises(BadInput, match=r"lens none misses .* calibrate with --lens equidistant"):
         calibrate_lens(views_of("equidistant", seed=4)[0], "none")
     found = calibrate_lens(views_of("radtan", seed=4)[0], "none")
@@ -270,7 +270,7 @@ def spoilt(kind):
     ],
 )
 @pytest.mark.parametrize("lens", ["none", pytest.param("equidistant", marks=pytest.mark.long)])
-def test_what_views_can_not_tell_is_refused_in_one_line(kind, line, lens) -> None:
+def test_views_that_determine_no_lens_are_refused_in_one_line(kind, line, lens) -> None:
     with pytest.raises(BadInput, match=rf"^shots: .*{line}") as error:
         calibrate_lens(spoilt(kind), lens, where="shots")
     assert "\n" not in str(error.value)
@@ -300,7 +300,7 @@ def test_a_board_that_is_not_that_of_its_file_is_named() -> None:
     )
 
 
-def test_the_views_that_are_chosen_tell_more() -> None:
+def test_the_views_that_are_chosen_determine_more() -> None:
     views, _ = views_of("equidistant", seed=10)
     truth = np.append(TRUTHS["equidistant"], 0.0)
     chosen = informative(views, "equidistant", truth, 6)

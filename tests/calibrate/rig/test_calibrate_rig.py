@@ -69,7 +69,7 @@ def test_cameras_and_markers_are_found_without_a_start(world, found):
     assert np.mean(found.weight < 1) < 0.01
 
 
-def test_the_covariance_says_how_wrong_it_is(world, found):
+def test_errors_are_as_large_as_the_covariance(world, found):
     rig, Ts_world_marker, _ = world
     true = np.concatenate([Ts_vehicle_camera(rig), Ts_world_marker])
     xi = rig_rooms.twists_to(np.concatenate([found.Ts_vehicle_camera, found.Ts_world_marker]), true)
@@ -261,8 +261,8 @@ def test_a_size_that_is_ten_times_too_large_shows(world):
     rig, Ts_world_marker, views = world
     size_m = views.size_m.copy()
     size_m[5] *= 10
-    said = dataclasses.replace(views, size_m=size_m)
-    found = calibrate_rig(said, rig, {0: Ts_world_marker[0]}, None)
-    assert sizes_m(found, said, rig)[5] == pytest.approx(rig_rooms.SIZE_M, rel=0.05)
-    check = held(world, found, said, {})
+    wrong = dataclasses.replace(views, size_m=size_m)
+    found = calibrate_rig(wrong, rig, {0: Ts_world_marker[0]}, None)
+    assert sizes_m(found, wrong, rig)[5] == pytest.approx(rig_rooms.SIZE_M, rel=0.05)
+    check = held(world, found, wrong, {})
     assert check.verdicts[5].wrong_size

@@ -63,7 +63,7 @@ def test_a_drive_with_turns_both_ways_is_enough():
     assert np.all(sigma < [0.01, 0.01, np.deg2rad(0.5)])
 
 
-def test_the_ground_follows_what_all_frames_have_in_common():
+def test_the_ground_moves_with_all_frames():
     """Against the frame found anew when every frame is moved by a small twist."""
     T_rig_vehicle = Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
     Ts_world_rig = rig_rooms.lemniscate(30) @ inverted(T_rig_vehicle)
@@ -106,7 +106,7 @@ def test_too_short_a_drive_is_refused():
         driven_frame(stamps, Ts_world_vehicle, *odometry, WHEELBASE_M)
 
 
-def test_a_drive_ties_the_cameras_to_the_vehicle_as_well_as_it_says():
+def test_a_drive_ties_the_cameras_to_the_vehicle_within_their_sigmas():
     """From corners to places on the vehicle, the ground being known by three markers."""
     stamps, Ts_world_vehicle, *odometry = drive(CIRCLES, noise=0.0)
     rig, room = rig_rooms.qcar(), rig_rooms.room()
