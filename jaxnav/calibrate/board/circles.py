@@ -1,4 +1,4 @@
-"""Grids of discs in an image: OpenCV finds them, their grey levels say where their centres are.
+"""Grids of discs in an image: OpenCV finds them, their grey levels give their centres.
 
 A tilted disc is drawn as an ellipse, through a lens as an egg, whose centroid is not the image of
 the disc's centre; a wide lens makes some tenths of a pixel of it. With a lens, and the pose that it
@@ -23,7 +23,7 @@ _LARGEST_PX = 1600  # longer side of the picture in which discs are looked for
 _LEAST_AREA_PX2 = 9.0
 _SURE = 0.1  # of the contrast: less ink is noise
 _ROUNDS = 3
-_AROUND = 6  # discs that say how one of them is drawn
+_AROUND = 6  # discs that one disc's picture is estimated from
 _GAP = 0.3  # of the gap between two discs: so far beyond its rim a disc's ink is looked for
 _RIM_POINTS = 64
 

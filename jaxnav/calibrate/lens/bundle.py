@@ -80,7 +80,7 @@ def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Arr
 def axis_px(lens: str, parameters: Float[Array, " 9"]) -> tuple[Float[Array, " 2"], Array]:
     """`Camera.axis_px`, and its derivatives (2, 9) by the nine.
 
-    Of a lens with xi, views tell fx and fy much worse: that coefficient makes up for them.
+    Of a lens with xi, views determine fx and fy much worse: that coefficient makes up for them.
     """
 
     def on_axis(parameters: Array) -> Array:

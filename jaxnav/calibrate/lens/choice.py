@@ -1,4 +1,4 @@
-"""Choice of the views that tell most about a lens, and of the lens that explains most of them.
+"""Choice of the most informative views, and of the lens that explains most of them.
 
 Views are chosen greedily: each raises the determinant of the information most. Lenses are compared
 by cross-validation: every one is fitted to three quarters of the views and has to explain the last
@@ -21,7 +21,7 @@ from jaxnav.calibrate.lens.fit import LensFit
 from jaxnav.calibrate.lens.start import board_poses
 
 FEWEST_VIEWS = 8  # to compare lenses by
-_WRONG = 10.0  # times the median view's error: a view beyond it tells nothing about the lens
+_WRONG = 10.0  # times the median view's error: a view beyond it is not used
 _NO_CURVE = 1e-9  # of the total information, so that the first views have a determinant
 _FOLDS = 4
 _WORSE = 1.02  # times radtan's error: no coefficients at all may be this much worse
@@ -32,7 +32,7 @@ _CLEARLY = 1.05, 3.0  # times the error, and standard errors of the difference
 def informative(
     views: BoardViews, lens: str, parameters: Float[np.ndarray, " 9"], most: int
 ) -> tuple[int, ...]:
-    """Indices, in order, of the at most `most` views that tell most about the lens.
+    """Indices, in order, of the at most `most` views that determine the lens best.
 
     Args:
         parameters: (9,) of the lens, roughly.

@@ -2,7 +2,7 @@
 
 First corners count less the further off they are (Cauchy), so that outliers are found without
 leading the fit astray. Then outliers are left out and plain least squares fits the rest, so that
-its covariance is honest; this is repeated until nothing changes. Views that are worse than the
+its covariance is right; this is repeated until nothing changes. Views that are worse than the
 others count less only where that changes the lens by more than chance would: which views are right
 is a guess where few disagree, and a lens that is led by it explains unseen views no better.
 
@@ -38,7 +38,7 @@ _ROBUST_ROUNDS, _ROUNDS = 3, 10
 _BY_CHANCE = 0.05  # probability that weights of good views change the lens by as much
 _NOTICED_SIGMAS = 2.0  # views that disagree by less may do so by chance
 _LEAST_SIGMA_PX = 1e-6
-_LEAST_LEFT = 1e-3  # of a direction that one view alone tells
+_LEAST_LEFT = 1e-3  # of a direction that one view alone determines
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ class _Problem:
         self, bundle: Bundle, weights: np.ndarray, sigma_px: float
     ) -> tuple[float, np.ndarray]:
         """The factor of the variances by which the views disagree, 1 where there are too few; and
-        the covariance (9, 9), zero for fixed parameters, infinite if the views tell nothing."""
+        the covariance (9, 9), zero for fixed parameters, infinite if undetermined."""
         information, gradient = map(
             np.asarray, lens_bundle.view_information(self.lens, bundle.unknowns, self.seen, weights)
         )
@@ -248,7 +248,7 @@ class _Problem:
         try:
             inverse = np.linalg.inv(each.sum(axis=0))
             factor = _leveraged_inflation(each, scores / sigma_px)
-        except np.linalg.LinAlgError:  # the views don't tell all of them
+        except np.linalg.LinAlgError:  # not all of them are determined
             pass
         if not np.all(np.diag(inverse) > 0):
             inverse[:] = np.inf
@@ -281,7 +281,7 @@ def _posed_anew(
 def _leveraged_inflation(
     information: Float[np.ndarray, "V p p"], scores: Float[np.ndarray, "V p"]
 ) -> float:
-    """The factor of the variances where few views tell much each; 1 if it is not noticed.
+    """The factor of the variances where few views weigh much each; 1 if it is not noticed.
 
     A view draws the solution towards itself, by its share of the information, so its score is
     smaller than its error: each is divided by the root of what is left of it. Of independent noise

@@ -43,7 +43,7 @@ _TILT = "tilt the board by 30 to 45 deg, to all sides, in 20 to 40 views"
 # Sigmas of the corners' noise from which on a coefficient makes unseen views better, not worse.
 # Source: Akaike (1974), "A new look at the statistical model identification".
 _WORTH = 2**0.5
-_GROWN = 1.01  # times the error of unseen views: more says that it was needed
+_GROWN = 1.01  # times the error of unseen views: more means that it was needed
 _LAST_FIRST = {
     "none": (),
     "radtan": ("k3", "k2", "k1"),
@@ -66,7 +66,7 @@ class LensCalibration:
     # any out
     held_out_px: dict[str, float]
     given: int  # number of views given
-    # view -> why it is not in the fit; views left out only because others tell more are not named
+    # view -> why it is not in the fit; views left out only because others are better are not named
     left_out: dict[str, str]
     downweighted: dict[str, float]  # view -> its weight, for views that count less than the others
     findings: tuple[str, ...]  # lines about what is wrong or was held at zero
@@ -130,7 +130,7 @@ def calibrate_lens(
 
     Args:
         lens: one of `bundle.FITTED`, or "auto" for that of `bundle.TRIED` best at unseen views.
-        max_views: the most views to fit; those that tell most are taken.
+        max_views: the most views to fit; the most informative are taken.
         where: the source of the views as the user gave it, for messages.
         stage: called with a word for every stage.
         unusable: image -> why it gave no view, for messages.
@@ -225,7 +225,7 @@ def _same(one: BoardView, other: BoardView) -> bool:
 
 
 def _undetermined_held(fit: LensFit, stage: Stage) -> LensFit:
-    """Refit the lens with coefficients at zero that the corners don't tell from it.
+    """Refit the lens with coefficients at zero that the corners don't determine.
 
     Such a coefficient is not worth its noise, unseen views do without it, and the image's border is
     not known with it. The sigmas are those of the lens with all of them: none is known better for

@@ -35,7 +35,7 @@ _ROUNDS, _STEPS = 8, 30
 _BETTER = 1.0  # a pose is replaced if another lowers its cost by more than this
 _TRIES = 10  # sightings of a marker that propose its pose
 _PARTS = 40  # of a recording, compared with each other
-_NOTICED = 1.3  # a smaller inflation of the variances counts as none: 40 parts tell no better
+_NOTICED = 1.3  # a smaller inflation of the variances counts as none: 40 parts can't show it
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ def _other_branches(
     say how many have moved.
 
     A frame has two possible poses, and a marker two for each of some sightings. A search that
-    begins at a mirrored pose ends there, and only a comparison of costs tells.
+    begins at a mirrored pose ends there, and only a comparison of costs shows it.
     """
     C, linker, links = len(rig), start.linker, start.links
     views, M = linker.views, len(linker.views.size_m)

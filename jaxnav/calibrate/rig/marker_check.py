@@ -21,7 +21,7 @@ from jaxnav.files.poses import transform
 _SIGMAS = 3.0  # deviations up to this many sigmas may be noise
 _WRONG_SIZE = 0.05  # relative error of the side that paper and print don't explain
 _MOVED = 0.2  # part of a marker's sightings that must disagree with the others for a move
-_FEW = 8  # fewer sightings tell neither a size nor a second place
+_FEW = 8  # of fewer sightings neither a size nor a second place is found
 _AGREE_RAD = 0.02  # largest angle between a ray and its corner for a sighting of the same place
 _STEPS = 30
 

@@ -265,18 +265,20 @@ def _fitted(*pairs: Array) -> tuple[np.ndarray, np.ndarray]:
     for heading in np.arange(4) * np.pi / 2:
         x, sigma = np.array([0, 0, heading, 0, 0, 0]), np.full(3, 0.01)
         for _ in range(3):
-            found = least_squares(
+            x = least_squares(
                 lambda *at: np.asarray(_misfits(*at)[0]),
                 x,
                 lambda *at: np.asarray(_misfits(*at)[1]),
                 x_scale="jac",
-                **dict.fromkeys(("ftol", "xtol", "gtol"), 1e-12),
+                ftol=1e-12,
+                xtol=1e-12,
+                gtol=1e-12,
                 max_nfev=40,
                 args=(sigma, *pairs),
-            )
-            x, apart = found.x, np.asarray(_apart(found.x, *pairs))
+            ).x
+            J, apart = np.asarray(_misfits(x, sigma, *pairs)[1]), np.asarray(_apart(x, *pairs))
             sigma = np.maximum(1.4826 * np.median(np.abs(apart), axis=0), _LEAST_SPREAD)
-        fits.append((np.sum(np.log(sigma)), x, np.linalg.pinv(found.jac.T @ found.jac)))
+        fits.append((np.sum(np.log(sigma)), x, np.linalg.pinv(J.T @ J)))
     _, x, covariance = min(fits, key=lambda fit: fit[0])
     return x, covariance
 
