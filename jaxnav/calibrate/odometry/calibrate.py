@@ -142,8 +142,14 @@ def calibrate_odometry(
         free = np.array([name not in why for name in NAMES])
         return fit(model, nodes, theta, free, prior, progress)
 
+    fits: dict[bytes, OdometryFit] = {}  # several errors may lead to the same start
+
     def started(theta: np.ndarray, error: float) -> OdometryFit:
-        return fitted(start(course, rig, markers, theta, error), theta)
+        nodes = start(course, rig, markers, theta, error)
+        key = nodes.tobytes() + theta.tobytes()
+        if key not in fits:
+            fits[key] = fitted(nodes, theta)
+        return fits[key]
 
     try:
         solution = started(theta, LOOSE)

@@ -169,10 +169,11 @@ def _check(args: CalibrateCheck) -> int:
         )
     out = output_folder(args.out)
     # Covariances stay, as twists are body-fixed.
+    move = check.T_map_world
     in_map = replace(
         calibration,
-        Ts_world_marker=check.T_map_world @ calibration.Ts_world_marker,
-        Ts_world_vehicle=check.T_map_world @ calibration.Ts_world_vehicle,
+        Ts_world_marker=move @ calibration.Ts_world_marker,
+        Ts_world_vehicle=move @ calibration.Ts_world_vehicle,
     )
     results = RigResults("check", data, in_map)
     report = results.report() | {
