@@ -226,10 +226,7 @@ def _move_px(before: BoardView | None, now: BoardView) -> float:
 
 
 def _what_is_seen(
-    board: Board,
-    looks: Sequence[BoardLook],
-    examples: Sequence[np.ndarray],
-    foreign: Sequence[int],
+    board: Board, looks: Sequence[BoardLook], examples: Sequence[np.ndarray], foreign: Sequence[int]
 ) -> str:
     """Say in one line why the board is not found.
 

@@ -19,14 +19,7 @@ from scipy import stats
 
 from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.calibrate.lens import bundle as lens_bundle
-from jaxnav.calibrate.lens.bundle import (
-    COUNT,
-    NAMES,
-    NO_CUT,
-    BoardCorners,
-    Bundle,
-    LensUnknowns,
-)
+from jaxnav.calibrate.lens.bundle import COUNT, NAMES, NO_CUT, BoardCorners, Bundle, LensUnknowns
 from jaxnav.calibrate.lens.start import board_poses, lens_start
 from jaxnav.core.models.camera import Camera
 

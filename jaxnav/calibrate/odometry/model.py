@@ -81,9 +81,7 @@ class Model:
 
 
 def corrected(
-    theta: Float[Array, " 5"],
-    speed_mps: Float[Array, "*N"],
-    steering_rad: Float[Array, "*N"],
+    theta: Float[Array, " 5"], speed_mps: Float[Array, "*N"], steering_rad: Float[Array, "*N"]
 ) -> tuple[Float[Array, "*N"], Float[Array, "*N"]]:
     """Correct the speed and steering of a reading by the parameters."""
     return theta[0] * speed_mps, theta[1] * steering_rad + theta[2]

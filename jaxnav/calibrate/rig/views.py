@@ -76,7 +76,10 @@ def both_poses(
     """
     forward = rays.mean(axis=1)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    R_camera_straight = _looking_along(forward)
+    aside = np.where(np.abs(forward[:, 1:2]) < 0.9, [[0.0, 1, 0]], [[1.0, 0, 0]])
+    x = np.cross(aside, forward)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    R_camera_straight = np.stack([x, np.cross(forward, x), forward], axis=2)
     straight = np.einsum("nji,nkj->nki", R_camera_straight, rays)
     corners_n = straight[..., :2] / np.maximum(straight[..., 2:], 1e-3)
     T = _in_batches(_solved, corners_n, size_m)
@@ -101,14 +104,6 @@ def _in_batches(function: Callable[..., Array], *rows: np.ndarray) -> np.ndarray
         shape = jax.eval_shape(function, *(jnp.asarray(array) for array in rows))
         return np.zeros(shape.shape)
     return np.concatenate(parts)[:count]
-
-
-def _looking_along(forward: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 3"]:
-    """Rotations with the given directions as z axes."""
-    aside = np.where(np.abs(forward[:, 1:2]) < 0.9, [[0.0, 1, 0]], [[1.0, 0, 0]])
-    x = np.cross(aside, forward)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(forward, x), forward], axis=2)
 
 
 def wxyz_xyz(Ts: Float[np.ndarray, "n 4 4"]) -> Float[Array, "n 7"]:

@@ -92,7 +92,7 @@ def test_points_are_found_to_hundredths_of_a_pixel(kind: str, pose: int) -> None
 @pytest.mark.parametrize(
     ("size", "inverted", "pose"),
     [
-        ((8, 8), False, 0),
+        pytest.param((8, 8), False, 0, marks=pytest.mark.long),
         pytest.param((9, 7), True, 1, marks=pytest.mark.long),
         pytest.param((7, 7), False, 2, marks=pytest.mark.long),
         ((7, 7), True, 0),

@@ -198,7 +198,12 @@ PRINTS = {
 
 
 @pytest.mark.parametrize(
-    "kind", [*list(PRINTS)[:2], pytest.param("chessboard", marks=pytest.mark.long), "marker"]
+    "kind",
+    [
+        "charuco",
+        *(pytest.param(kind, marks=pytest.mark.long) for kind in ("aprilgrid", "chessboard")),
+        "marker",
+    ],
 )
 def test_prints_are_true_to_scale(kind: str, tmp_path: Path) -> None:
     # A paper of whole pixels at 200 an inch, so that no rasteriser stretches it.

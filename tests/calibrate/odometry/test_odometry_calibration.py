@@ -16,15 +16,7 @@ from jaxnav.calibrate.odometry.fit import Prior, System
 from jaxnav.calibrate.odometry.model import NAMES, Model
 from jaxnav.errors import BadInput
 from tests import worlds
-from tests.helpers.odometry_drives import (
-    RECIPE,
-    START,
-    TRUTH,
-    Leg,
-    Sensors,
-    sensed,
-    true_track,
-)
+from tests.helpers.odometry_drives import RECIPE, START, TRUTH, Leg, Sensors, sensed, true_track
 
 BEFORE = dict(zip(NAMES, (1.0, 1.0, 0.0, 0.256, 0.0), strict=True))
 STRAIGHT = -TRUTH[2] / TRUTH[1] / 0.5  # of the servo's limit, where the car drives straight
