@@ -6,12 +6,14 @@ import jaxlie
 import numpy as np
 import pytest
 import rig_rooms
+from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.rig.calibrate import calibrate_rig
 from jaxnav.calibrate.rig.vehicle_frame import _level, driven_frame, level_follows, moved_to_driven
 from jaxnav.calibrate.rig.views import Ts_vehicle_camera, inverted
 from jaxnav.core.models.vehicle import advance_bicycle
 from jaxnav.errors import BadInput
+from jaxnav.files.poses import transform
 
 WHEELBASE_M, DT_S = 0.256, 0.02
 SCALE, OFFSET_RAD, GAIN = 1.04, 0.015, 0.93  # of the odometry
@@ -36,11 +38,8 @@ def drive(steering_rad: np.ndarray, noise: float = 1e-3):
     measured = speed_mps / SCALE + rng.normal(0, 0.005, count)
     turned = (steering_rad - OFFSET_RAD) / GAIN + rng.normal(0, 0.005, count)
     noisy = np.asarray(poses) + rng.normal(0, noise, (count, 3))
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, 0, 0] = T[:, 1, 1] = np.cos(noisy[:, 2])
-    T[:, 1, 0] = np.sin(noisy[:, 2])
-    T[:, 0, 1] = -np.sin(noisy[:, 2])
-    T[:, :2, 3] = noisy[:, :2]
+    turn = Rotation.from_euler("z", noisy[:, 2]).as_matrix()
+    T = transform(turn, np.pad(noisy[:, :2], ((0, 0), (0, 1))))
     times = DT_S * np.arange(count)
     return times[::2] + 0.004, T[::2], times, measured, turned
 
@@ -91,11 +90,8 @@ def test_a_straight_line_is_refused():
 
 def test_a_rig_in_the_hand_is_refused():
     stamps, Ts_world_vehicle, *odometry = drive(EIGHT)
-    angle = 0.3 * np.sin(np.arange(len(stamps)) / 7)
-    tilt = np.tile(np.eye(4), (len(stamps), 1, 1))
-    tilt[:, 1, 1] = tilt[:, 2, 2] = np.cos(angle)
-    tilt[:, 2, 1] = np.sin(angle)
-    tilt[:, 1, 2] = -np.sin(angle)
+    angle_rad = 0.3 * np.sin(np.arange(len(stamps)) / 7)
+    tilt = transform(Rotation.from_euler("x", angle_rad).as_matrix(), np.zeros((len(stamps), 3)))
     with pytest.raises(BadInput, match=r"tilts by .* level ground"):
         driven_frame(stamps, Ts_world_vehicle @ tilt, *odometry, WHEELBASE_M)
 
