@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.calibrate.schur import Blocks, SchurLM
@@ -54,7 +54,6 @@ class Bundle(eqx.Module):
 
     unknowns: LensUnknowns
     residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 for points not seen
-    steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
 
@@ -162,7 +161,6 @@ def solve(
     return Bundle(
         unknowns=solution.value,
         residual_px=residuals_px(lens, solution.value, seen),
-        steps=state.steps,
         converged=state.done,
     )
 
