@@ -38,7 +38,7 @@ def drive(steering_rad: np.ndarray, noise: float = 1e-3):
     measured = speed_mps / SCALE + rng.normal(0, 0.005, count)
     turned = (steering_rad - OFFSET_RAD) / GAIN + rng.normal(0, 0.005, count)
     noisy = np.asarray(poses) + rng.normal(0, noise, (count, 3))
-    turn = Rotation.from_euler("z", noisy[:, 2]).as_matrix()
+    turn = Rotation.from_euler("z", noisy[:, 2:]).as_matrix()
     T = transform(turn, np.pad(noisy[:, :2], ((0, 0), (0, 1))))
     times = DT_S * np.arange(count)
     return times[::2] + 0.004, T[::2], times, measured, turned
@@ -91,7 +91,9 @@ def test_a_straight_line_is_refused():
 def test_a_rig_in_the_hand_is_refused():
     stamps, Ts_world_vehicle, *odometry = drive(EIGHT)
     angle_rad = 0.3 * np.sin(np.arange(len(stamps)) / 7)
-    tilt = transform(Rotation.from_euler("x", angle_rad).as_matrix(), np.zeros((len(stamps), 3)))
+    tilt = transform(
+        Rotation.from_euler("x", angle_rad[:, None]).as_matrix(), np.zeros((len(stamps), 3))
+    )
     with pytest.raises(BadInput, match=r"tilts by .* level ground"):
         driven_frame(stamps, Ts_world_vehicle @ tilt, *odometry, WHEELBASE_M)
 
