@@ -35,6 +35,8 @@ _LEAST_SPREAD = 1e-5  # m and rad: nothing is known better than this
 # The largest sigmas that are accepted.
 _SIGMA_M, _SIGMA_RAD = 0.02, np.deg2rad(1)
 _NAMES = ("x", "y", "heading", "speed scale", "steering offset", "steering gain")
+# On a straight line the gain could be anything: it stays within a factor of 20, so does the scale.
+_MOST = np.array([np.inf, np.inf, np.inf, 3.0, 1.0, 3.0])
 
 
 @dataclass(frozen=True)
@@ -269,6 +271,7 @@ def _fitted(*pairs: Array) -> tuple[np.ndarray, np.ndarray]:
                 lambda *at: np.asarray(_misfits(*at)[0]),
                 x,
                 lambda *at: np.asarray(_misfits(*at)[1]),
+                bounds=(-_MOST, _MOST),
                 x_scale="jac",
                 ftol=1e-12,
                 xtol=1e-12,
