@@ -9,7 +9,7 @@ in the centre of its ink. There are six kinds:
     aprilgrid   tags in a grid with black squares between their corners (Kalibr's layout); its
                 points are the corners of the tags
     chessboard  squares alone, in either colour; its points are the corners between them. One that
-                looks the same when it is turned tells a lens as well as any other
+                looks the same when it is turned is as good for a lens as any other
     marker      one navigation marker; its points are its four corners
     circles     discs in rows and columns; its points are their centres
     asymmetric_circles   the same with every second row half a step further (OpenCV's layout)

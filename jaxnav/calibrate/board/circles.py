@@ -1,4 +1,4 @@
-"""Grids of discs in an image: OpenCV finds them, their grey levels say where their centres are.
+"""Grids of discs in an image: OpenCV finds them, their grey levels give their centres.
 
 A tilted disc is drawn as an ellipse, through a lens as an egg, whose centroid is not the image of
 the disc's centre; a wide lens makes some tenths of a pixel of it. With a lens, and the pose that it
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.board.board import Board
 from jaxnav.calibrate.board.places import is_mirrored
-from jaxnav.calibrate.board.views import pose_from_rays
+from jaxnav.calibrate.board.views import pose_from_rays, project, unproject
 from jaxnav.core.models.camera import Camera
 from jaxnav.detection.types import at_scale
 
@@ -23,7 +23,7 @@ _LARGEST_PX = 1600  # longer side of the picture in which discs are looked for
 _LEAST_AREA_PX2 = 9.0
 _SURE = 0.1  # of the contrast: less ink is noise
 _ROUNDS = 3
-_AROUND = 6  # discs that say how one of them is drawn
+_AROUND = 6  # discs that one disc's picture is estimated from
 _GAP = 0.3  # of the gap between two discs: so far beyond its rim a disc's ink is looked for
 _RIM_POINTS = 64
 
@@ -110,7 +110,7 @@ def _centroid(levels: np.ndarray, at_px: np.ndarray, A: np.ndarray, reach_m: flo
 
 def _unbiased(board: Board, centroids_px: np.ndarray, camera: Camera) -> np.ndarray:
     """The images of the discs' centres, from their centroids and a lens."""
-    rays = np.array(camera.unproject(jnp.asarray(centroids_px)), float)
+    rays = np.array(unproject(camera, jnp.asarray(centroids_px)), float)
     pose = pose_from_rays(board.points_board_m, rays)
     if np.isnan(pose[0]):
         return centroids_px
@@ -120,7 +120,7 @@ def _unbiased(board: Board, centroids_px: np.ndarray, camera: Camera) -> np.ndar
         [board.points_board_m[:, None], board.points_board_m[:, None] + rim_m], axis=1
     )
     R_camera_board = Rotation.from_quat(np.roll(pose[:4], -1)).as_matrix()
-    drawn_px = np.asarray(camera.project(jnp.asarray(points_m @ R_camera_board.T + pose[4:])))
+    drawn_px = np.asarray(project(camera, jnp.asarray(points_m @ R_camera_board.T + pose[4:])))
     centres_px, (x, y) = drawn_px[:, 0], np.moveaxis(drawn_px[:, 1:], -1, 0)
     # Centroid of a polygon.
     x_next, y_next = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)

@@ -33,7 +33,7 @@ from jaxnav.detection.types import at_scale, grey
 
 _FEW_TAGS = 0.5  # of the tags: where fewer are read, the image is read again at twice its size
 _MAX_CORRECTION = 0.4  # part of the bits that a family can correct
-_FEWEST_TAGS = 4  # tell how a charuco board is printed
+_FEWEST_TAGS = 4  # to find out how a charuco board is printed
 _OTHER, _MOST_STRAY = 0.5, 2.0  # of the misfit of the other layout; most that one tag counts for
 _GROWTHS = 4  # how often the set of found points is extended by one pitch
 _RADIUS = 0.45  # of a square: radius of the patch around a saddle

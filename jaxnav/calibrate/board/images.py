@@ -44,7 +44,6 @@ class CollectedViews:
     duplicates: tuple[tuple[str, str], ...]  # (name, name of the image that it repeats)
     unreadable: tuple[tuple[str, str], ...]  # (name, why it can't be read)
     without_board: tuple[str, ...]  # names of images in which the board is not seen
-    foreign_ids: tuple[int, ...]  # ids seen often of the board's family that are not on the board
     other_pattern: bool  # true if a charuco board is seen in the pattern that its file does not say
 
 
@@ -138,7 +137,6 @@ def collect_views(
         tuple(duplicates),
         tuple((name, str(error).partition(": ")[2]) for name, error in unreadable),
         tuple(without),
-        tuple(foreign),
         other_pattern=board.kind == "charuco" and other > len(printed) / 2,
     )
 
@@ -228,10 +226,7 @@ def _move_px(before: BoardView | None, now: BoardView) -> float:
 
 
 def _what_is_seen(
-    board: Board,
-    looks: Sequence[BoardLook],
-    examples: Sequence[np.ndarray],
-    foreign: Sequence[int],
+    board: Board, looks: Sequence[BoardLook], examples: Sequence[np.ndarray], foreign: Sequence[int]
 ) -> str:
     """Say in one line why the board is not found.
 

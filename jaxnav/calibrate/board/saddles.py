@@ -108,7 +108,7 @@ def fit_saddles(
         tried_residual, tried_jacobian = _residual(tried, patch)
         tried_loss = np.sum(tried_residual**2, axis=1)
         better = tried_loss <= loss
-        # Damping also makes steps short; the noise tells a minimum from a dead end.
+        # Damping also makes steps short; the noise distinguishes a minimum from a dead end.
         converged |= np.abs(step[:, :2]).max(axis=1) < _CONVERGED_PX
         state[better], loss[better] = tried[better], tried_loss[better]
         residual[better], jacobian[better] = tried_residual[better], tried_jacobian[better]

@@ -3,12 +3,16 @@
 from dataclasses import dataclass
 
 import cv2
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
+from jaxnav.core.models.camera import Camera
+
 _WIDEST = np.tan(np.deg2rad(80.0))  # from the middle of a view; steeper rays weigh too much
 FEWEST_CORNERS = 4  # a pose can be found from
+project, unproject = jax.jit(Camera.project), jax.jit(Camera.unproject)
 
 
 @dataclass(frozen=True)

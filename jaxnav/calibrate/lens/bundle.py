@@ -1,7 +1,7 @@
 """Bundle adjustment of one camera and all its views of a board.
 
 The unknowns are the lens, nine numbers that all views share, and the pose of the board in every
-view. The poses are eliminated (`core.linalg.schur`), so time and memory grow linearly with the
+view. The poses are eliminated (`calibrate.schur`), so time and memory grow linearly with the
 number of views. The frame is the board's, so there is no gauge to fix.
 """
 
@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
 from jaxnav.calibrate.board.views import BoardViews
+from jaxnav.calibrate.schur import Blocks, SchurLM
 from jaxnav.core.linalg.levenberg_marquardt import LMState
-from jaxnav.core.linalg.schur import Blocks, SchurLM, reduce
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import cayley, rotation_matrix, skew, turn_and_shift
 from jaxnav.core.models.lenses import LENSES, MOST_COEFFICIENTS
@@ -54,8 +54,6 @@ class Bundle(eqx.Module):
 
     unknowns: LensUnknowns
     residual_px: Float[Array, "V P 2"]  # predicted - seen; 0 for points not seen
-    blocks: Blocks  # in pixels, weighted as in the fit
-    steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
 
@@ -81,7 +79,7 @@ def retracted(wxyz_xyz: Float[Array, " 7"], xi: Float[Array, " 6"]) -> Float[Arr
 def axis_px(lens: str, parameters: Float[Array, " 9"]) -> tuple[Float[Array, " 2"], Array]:
     """`Camera.axis_px`, and its derivatives (2, 9) by the nine.
 
-    Of a lens with xi, views tell fx and fy much worse: that coefficient makes up for them.
+    Of a lens with xi, views determine fx and fy much worse: that coefficient makes up for them.
     """
 
     def on_axis(parameters: Array) -> Array:
@@ -119,6 +117,7 @@ def padded(
     return seen, LensUnknowns(jnp.asarray(parameters), jnp.asarray(poses))
 
 
+@partial(jax.jit, static_argnames="lens")
 def solve(
     lens: str,
     start: LensUnknowns,
@@ -138,30 +137,15 @@ def solve(
         free: mask of the nine shared unknowns that move.
         cut: in sigmas; `NO_CUT` for plain least squares.
     """
-    numbers = jnp.asarray(weights, float), jnp.asarray(free)
-    scalars = jnp.asarray(sigma_px), jnp.asarray(cut)
-    return jax.block_until_ready(_solved(lens, start, seen, *numbers, *scalars))
-
-
-@partial(jax.jit, static_argnames="lens")
-def _solved(
-    lens: str,
-    start: LensUnknowns,
-    seen: BoardCorners,
-    weights: Array,
-    free: Array,
-    sigma_px: Array,
-    cut: Array,
-) -> Bundle:
-    weights = jnp.where(seen.present, weights, 0)
-    scale = jnp.sqrt(weights) / sigma_px
+    scale = jnp.sqrt(jnp.where(seen.present, weights, 0.0)) / sigma_px
+    free = jnp.asarray(free)
 
     def fn(y: LensUnknowns, args: Any) -> Any:
         residual_px, of_lens, of_pose = linearised(lens, y, seen)
         squared = jnp.sum(residual_px**2, axis=-1) * scale**2
         cost = cut**2 * jnp.log1p(squared / cut**2)
         counts = scale / jnp.sqrt(1 + squared / cut**2)
-        return jnp.sqrt(cost).reshape(-1), normal_equations(residual_px, of_lens, of_pose, counts)
+        return jnp.sqrt(cost).reshape(-1), _normal_equations(residual_px, of_lens, of_pose, counts)
 
     solution: optx.Solution = optx.least_squares(
         fn,
@@ -174,21 +158,11 @@ def _solved(
         throw=False,
     )
     state: LMState = solution.state
-    residual_px = _predicted(lens, solution.value, seen) - seen.corners_px
-    blocks = jax.tree.map(lambda leaf: leaf * sigma_px**2, state.normal)
     return Bundle(
         unknowns=solution.value,
-        residual_px=jnp.where(seen.present[..., None], residual_px, 0),
-        blocks=blocks,
-        steps=state.steps,
+        residual_px=residuals_px(lens, solution.value, seen),
         converged=state.done,
     )
-
-
-@jax.jit
-def lens_information(blocks: Blocks, free: Bool[Array, " 9"]) -> Float[Array, "9 9"]:
-    """Information of the nine, poses eliminated, for 1 px of noise; identity for fixed ones."""
-    return reduce(blocks, free, jnp.zeros(())).system
 
 
 @partial(jax.jit, static_argnames="lens")
@@ -199,11 +173,19 @@ def view_information(
 
     Also the gradient of half the cost of each view by the nine.
     """
-    residual_px, of_lens, of_pose = linearised(lens, y, seen)
-    root = jnp.sqrt(jnp.where(seen.present, weights, 0))[..., None, None]
-    A, B = (
-        (root * J).reshape(J.shape[0], -1, J.shape[-1]) for J in (of_lens, of_pose)
-    )  # (V, 2P, 9), (V, 2P, 6)
+    return without_poses(*linearised(lens, y, seen), jnp.where(seen.present, weights, 0))
+
+
+def without_poses(
+    residual_px: Float[Array, "V P 2"],
+    of_shared: Float[Array, "V P 2 R"],
+    of_pose: Float[Array, "V P 2 6"],
+    weights: Float[Array, "V P"],
+) -> tuple[Float[Array, "V R R"], Float[Array, "V R"]]:
+    """Information of shared unknowns from each view and gradient, its pose eliminated."""
+    root = jnp.sqrt(weights)[..., None, None]
+    # (V, 2P, R), (V, 2P, 6)
+    A, B = ((root * J).reshape(J.shape[0], -1, J.shape[-1]) for J in (of_shared, of_pose))
     r = (root[..., 0] * residual_px).reshape(A.shape[0], -1, 1)
     length = jnp.sqrt(jnp.sum(B**2, axis=1, keepdims=True))
     Q, _ = jnp.linalg.qr(B / jnp.where(length > 0, length, 1))
@@ -215,20 +197,16 @@ def view_information(
 @partial(jax.jit, static_argnames="lens")
 def residuals_px(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "V P 2"]:
     """Residuals, predicted - seen; 0 for points not seen."""
-    return jnp.where(seen.present[..., None], _predicted(lens, y, seen) - seen.corners_px, 0)
-
-
-def _predicted(lens: str, y: LensUnknowns, seen: BoardCorners) -> Float[Array, "V P 2"]:
     camera = camera_of(lens, y.lens)
-    points_board_m = jnp.asarray(seen.points_board_m)
 
     def view(wxyz_xyz: Array) -> Array:
         T_camera_board = jaxlie.SE3(wxyz_xyz)
         R_camera_board = rotation_matrix(T_camera_board.rotation())
         t_m = T_camera_board.translation()
-        return camera.project(turn_and_shift(R_camera_board, t_m, points_board_m))
+        return camera.project(turn_and_shift(R_camera_board, t_m, jnp.asarray(seen.points_board_m)))
 
-    return jax.vmap(view)(y.Ts_camera_board)
+    residual_px = jax.vmap(view)(y.Ts_camera_board) - seen.corners_px
+    return jnp.where(seen.present[..., None], residual_px, 0)
 
 
 def linearised(
@@ -258,7 +236,7 @@ def linearised(
     return projected - seen.corners_px, of_lens, of_pose
 
 
-def normal_equations(
+def _normal_equations(
     residual_px: Float[Array, "V P 2"],
     of_lens: Float[Array, "V P 2 R"],
     of_pose: Float[Array, "V P 2 6"],

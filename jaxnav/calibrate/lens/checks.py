@@ -14,7 +14,6 @@ from jaxnav.calibrate.lens import bundle as lens_bundle
 from jaxnav.calibrate.lens.bundle import BoardCorners, LensUnknowns
 from jaxnav.calibrate.lens.fit import LensFit
 from jaxnav.calibrate.lens.maps import ray_slopes
-from jaxnav.core.linalg.schur import reduce
 
 _CELLS_WIDE = 8
 _RIM_POINTS = 9  # along each side of the image
@@ -31,18 +30,18 @@ def findings(fit: LensFit, better: str) -> tuple[str, ...]:
         better: the lens that explains unseen views clearly better, or else the fit's own lens.
     """
     lens, seen, draws_all = fit.lens, cells(fit), bool(np.isfinite(rim_sigma_px(fit)))
-    said = []
+    lines = []
     if fit.fixed:
-        said.append(
+        lines.append(
             f"{', '.join(fit.fixed)} held at zero: corners reach {100 * reach(fit):.0f} % of the "
             "way to the image's corner"
         )
     if better != lens:
-        said.append(f"lens {better} explains unseen views clearly better: try --lens {better}")
+        lines.append(f"lens {better} explains unseen views clearly better: try --lens {better}")
     if not draws_all:
-        said.append(f"lens {lens} does not reach the image's border: try another --lens")
+        lines.append(f"lens {lens} does not reach the image's border: try another --lens")
     if seen.p_value < _CHANCE and seen.systematic_px > _SYSTEMATIC * fit.sigma_px:
-        said.append(
+        lines.append(
             f"residuals are systematic, {seen.systematic_px:.2g} px beside {fit.sigma_px:.2g} px "
             "of noise: another lens, or a board that is not flat"
         )
@@ -50,26 +49,26 @@ def findings(fit: LensFit, better: str) -> tuple[str, ...]:
         board = check_board(fit)
         size_m = float(np.linalg.norm(np.ptp(fit.views.points_board_m, axis=0)))
         if abs(board.stretch) > max(_STRETCH, 5 * board.stretch_sigma):
-            said.append(
+            lines.append(
                 f"the board is {100 * board.stretch:+.2g} % taller for its width than its file "
                 "says: measure both sides"
             )
         if board.p_value < _CHANCE and board.offset_m > _OFFSET * size_m:
-            said.append(
+            lines.append(
                 f"points of the board lie {1000 * board.offset_m:.2g} mm from where its file says: "
                 "measure squares and gaps, and see that it is flat"
             )
     if unseen := _unseen_sides(fit):
-        said.append(
+        lines.append(
             f"no view shows the {' nor the '.join(unseen)} of the board's points: are there as "
             "many rows and columns as its file says?"
         )
     worse, count = int(np.sum(fit.view_weights < 1)), len(fit.view_weights)
     if worse > count / 3:
-        said.append(f"{worse} of {count} views fit worse: blur, or a board that bends")
+        lines.append(f"{worse} of {count} views fit worse: blur, or a board that bends")
     if not fit.converged:
-        said.append("the search was ended before it had settled")
-    return tuple(said)
+        lines.append("the search was ended before it had settled")
+    return tuple(lines)
 
 
 def advice(fit: LensFit) -> tuple[str, ...]:
@@ -125,7 +124,7 @@ def rim_sigma_px(fit: LensFit) -> float:
     w, h = np.array(fit.views.image_size_px) - 1.0
     part = np.linspace(0, 1, _RIM_POINTS)
     pixels = np.concatenate([[[w * p, 0], [w * p, h], [0, h * p], [w, h * p]] for p in part])
-    J, _, drawn = ray_slopes(fit.lens, fit.parameters, pixels)
+    J, _, drawn = jax.device_get(ray_slopes(fit.lens, fit.parameters, pixels))
     if not np.all(drawn):
         return np.inf
     radial = np.array([name[0] not in "cp" for name in fit.names], float)
@@ -170,13 +169,11 @@ def cells(fit: LensFit) -> Cells:
     wide, high = _CELLS_WIDE, max(2, round(_CELLS_WIDE * height / width))
     at = (fit.used_px + 0.5) / [width, height] * [wide, high]
     column, row = np.clip(at, 0, [wide - 1, high - 1]).astype(int).T
-    weights = fit.weights[fit.used]
-    counts, totals = np.zeros((high, wide), int), np.zeros((high, wide))
-    sums = np.zeros((high, wide, 2))
-    np.add.at(counts, (row, column), 1)
-    np.add.at(totals, (row, column), weights)
-    np.add.at(sums, (row, column), weights[:, None] * fit.residual_px[fit.used])
-    mean_px = sums / np.maximum(totals, 1e-12)[..., None]
+    residuals = np.column_stack([np.ones(len(at)), fit.residual_px[fit.used]])
+    sums = np.zeros((high, wide, 3))
+    np.add.at(sums, (row, column), fit.weights[fit.used][:, None] * residuals)
+    counts = np.histogram2d(row, column, (range(high + 1), range(wide + 1)))[0].astype(int)
+    totals, mean_px = sums[..., 0], sums[..., 1:] / np.maximum(sums[..., :1], 1e-12)
     # A mean of total weight W has the variance sigma^2 / W in x and in y.
     filled = counts > 0
     squared = np.sum(mean_px[filled] ** 2, axis=-1)
@@ -249,11 +246,6 @@ def _board_freedom(
     residual_px, of_lens, of_pose = lens_bundle.linearised(lens, y, seen)
     of_point = of_pose[..., :2]  # a pose that shifts along the board's x and y
     stretch = of_point[..., 1:] * seen.points_board_m[None, :, None, 1:2]
-    blocks = lens_bundle.normal_equations(
-        residual_px,
-        jnp.concatenate([of_lens, stretch], axis=-1),
-        of_pose,
-        jnp.sqrt(jnp.where(seen.present, weights, 0)),
-    )
-    reduced = reduce(blocks, jnp.ones(of_lens.shape[-1] + 1, bool), jnp.zeros(()))
-    return of_point, reduced.system, reduced.gradient
+    shared = jnp.concatenate([of_lens, stretch], axis=-1)
+    information, gradient = lens_bundle.without_poses(residual_px, shared, of_pose, weights)
+    return of_point, jnp.sum(information, axis=0), jnp.sum(gradient, axis=0)

@@ -1,4 +1,4 @@
-"""Choice of the views that tell most about a lens, and of the lens that explains most of them.
+"""Choice of the most informative views, and of the lens that explains most of them.
 
 Views are chosen greedily: each raises the determinant of the information most. Lenses are compared
 by cross-validation: every one is fitted to three quarters of the views and has to explain the last
@@ -9,7 +9,6 @@ assessment of statistical predictions".
 """
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +21,7 @@ from jaxnav.calibrate.lens.fit import LensFit
 from jaxnav.calibrate.lens.start import board_poses
 
 FEWEST_VIEWS = 8  # to compare lenses by
-_WRONG = 10.0  # times the median view's error: a view beyond it tells nothing about the lens
+_WRONG = 10.0  # times the median view's error: a view beyond it is not used
 _NO_CURVE = 1e-9  # of the total information, so that the first views have a determinant
 _FOLDS = 4
 _WORSE = 1.02  # times radtan's error: no coefficients at all may be this much worse
@@ -33,7 +32,7 @@ _CLEARLY = 1.05, 3.0  # times the error, and standard errors of the difference
 def informative(
     views: BoardViews, lens: str, parameters: Float[np.ndarray, " 9"], most: int
 ) -> tuple[int, ...]:
-    """Indices, in order, of the at most `most` views that tell most about the lens.
+    """Indices, in order, of the at most `most` views that determine the lens best.
 
     Args:
         parameters: (9,) of the lens, roughly.
@@ -65,17 +64,9 @@ def informative(
     return tuple(sorted(chosen))
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """Errors of views that a lens was not fitted to."""
-
-    # standard deviation of a corner's x and of its y; NaN for views without weight
-    view_px: Float[np.ndarray, " V"]
-    rms_px: float  # root mean square of `view_px`
-
-
-def held_out(fit: LensFit, weights: Float[np.ndarray, "V P"]) -> HeldOut:
-    """The error of every view under the lens fitted without it.
+def held_out_px(fit: LensFit, weights: Float[np.ndarray, "V P"]) -> Float[np.ndarray, " V"]:
+    """The error of every view under the lens fitted without it: the standard deviation of a
+    corner's x and of its y; NaN for views without weight.
 
     Args:
         weights: (V, P) of the corners, the same for all lenses that are compared.
@@ -96,19 +87,26 @@ def held_out(fit: LensFit, weights: Float[np.ndarray, "V P"]) -> HeldOut:
         freedom = 2 * np.sum(padded > 0, axis=1) - 6
         rated = np.flatnonzero((fold[:count] == number) & (freedom[:count] > 0))
         view_px[rated] = np.sqrt(squared[rated] / freedom[rated])
-    return HeldOut(view_px, float(np.sqrt(np.nanmean(view_px**2))))
+    return view_px
 
 
-def compared(fits: Mapping[str, LensFit]) -> dict[str, HeldOut]:
+def rms(view_px: Float[np.ndarray, " V"]) -> float:
+    """Root mean square of the errors of views, of those that have one."""
+    return float(np.sqrt(np.nanmean(view_px**2)))
+
+
+def compared(fits: Mapping[str, LensFit]) -> dict[str, Float[np.ndarray, " V"]]:
     """The errors of unseen views under every lens; empty where there are too few of either."""
     trusted = min(fits.values(), key=lambda fit: fit.sigma_px)
     if len(fits) < 2 or np.sum(trusted.view_weights > 0) < FEWEST_VIEWS:
         return {}
-    return {lens: held_out(fit, trusted.weights) for lens, fit in fits.items()}
+    return {lens: held_out_px(fit, trusted.weights) for lens, fit in fits.items()}
 
 
 def best_lens(
-    fits: Mapping[str, LensFit], errors: Mapping[str, HeldOut], drawn: Collection[str]
+    fits: Mapping[str, LensFit],
+    errors: Mapping[str, Float[np.ndarray, " V"]],
+    drawn: Collection[str],
 ) -> str:
     """The lens that most programs read, radtan, unless another is clearly better.
 
@@ -121,17 +119,17 @@ def best_lens(
         usual = "radtan" in drawn and fits["radtan"].sigma_px < _FEW_WORSE * fits[least].sigma_px
         return "radtan" if usual else least
     usual_lens = "radtan" if "radtan" in drawn or not drawn else next(iter(drawn))
-    if errors["none"].rms_px <= _WORSE * errors[usual_lens].rms_px:
+    if rms(errors["none"]) <= _WORSE * rms(errors[usual_lens]):
         usual_lens = "none"
-    best = min(drawn or errors, key=lambda lens: errors[lens].rms_px)
+    best = min(drawn or errors, key=lambda lens: rms(errors[lens]))
     return best if clearly_better(errors[best], errors[usual_lens]) else usual_lens
 
 
-def clearly_better(one: HeldOut, other: HeldOut) -> bool:
-    """True if one lens explains unseen views better than the other, by more than chance."""
+def clearly_better(one: Float[np.ndarray, " V"], other: Float[np.ndarray, " V"]) -> bool:
+    """True if one lens's errors of unseen views are smaller than another's, by more than chance."""
     ratio, errors = _CLEARLY
-    difference = np.log(other.view_px / one.view_px)
+    difference = np.log(other / one)
     difference = difference[np.isfinite(difference)]
-    if len(difference) < 2 or other.rms_px < ratio * one.rms_px:
+    if len(difference) < 2 or rms(other) < ratio * rms(one):
         return False
     return bool(difference.mean() > errors * difference.std(ddof=1) / np.sqrt(len(difference)))

@@ -2,7 +2,7 @@
 
 First corners count less the further off they are (Cauchy), so that outliers are found without
 leading the fit astray. Then outliers are left out and plain least squares fits the rest, so that
-its covariance is honest; this is repeated until nothing changes. Views that are worse than the
+its covariance is right; this is repeated until nothing changes. Views that are worse than the
 others count less only where that changes the lens by more than chance would: which views are right
 is a guess where few disagree, and a lens that is led by it explains unseen views no better.
 
@@ -19,14 +19,7 @@ from scipy import stats
 
 from jaxnav.calibrate.board.views import BoardViews
 from jaxnav.calibrate.lens import bundle as lens_bundle
-from jaxnav.calibrate.lens.bundle import (
-    COUNT,
-    NAMES,
-    NO_CUT,
-    BoardCorners,
-    Bundle,
-    LensUnknowns,
-)
+from jaxnav.calibrate.lens.bundle import COUNT, NAMES, NO_CUT, BoardCorners, Bundle, LensUnknowns
 from jaxnav.calibrate.lens.start import board_poses, lens_start
 from jaxnav.core.models.camera import Camera
 
@@ -38,7 +31,7 @@ _ROBUST_ROUNDS, _ROUNDS = 3, 10
 _BY_CHANCE = 0.05  # probability that weights of good views change the lens by as much
 _NOTICED_SIGMAS = 2.0  # views that disagree by less may do so by chance
 _LEAST_SIGMA_PX = 1e-6
-_LEAST_LEFT = 1e-3  # of a direction that one view alone tells
+_LEAST_LEFT = 1e-3  # of a direction that one view alone determines
 
 
 @dataclass(frozen=True)
@@ -121,7 +114,7 @@ def fit_lens(
     seen, y = lens_bundle.padded(views, parameters, poses)
     problem = _Problem(lens, seen, free, np.pad(posed, (0, len(seen.corners_px) - count)))
 
-    weights = problem.posed[:, None] * seen.present
+    weights = np.where(problem.posed[:, None], seen.present, 0.0)
     sigma_px = problem.typical_px(np.asarray(lens_bundle.residuals_px(lens, y, seen)))
     for _ in range(_ROBUST_ROUNDS):
         bundle = problem.solved(y, weights, sigma_px, _CUT)
@@ -236,29 +229,25 @@ class _Problem:
         self, bundle: Bundle, weights: np.ndarray, sigma_px: float
     ) -> tuple[float, np.ndarray]:
         """The factor of the variances by which the views disagree, 1 where there are too few; and
-        the covariance (9, 9), zero for fixed parameters, infinite if the views tell nothing."""
-        information, gradient = lens_bundle.view_information(
-            self.lens, bundle.unknowns, self.seen, jnp.asarray(weights)
+        the covariance (9, 9), zero for fixed parameters, infinite if undetermined."""
+        information, gradient = map(
+            np.asarray, lens_bundle.view_information(self.lens, bundle.unknowns, self.seen, weights)
         )
         shown = np.any(weights > 0, axis=1)
-        each = np.asarray(information)[shown][:, self.free][:, :, self.free]
-        scores = np.asarray(gradient)[shown][:, self.free] / sigma_px
+        each = information[shown][:, self.free][:, :, self.free]
         scale = 1 / np.sqrt(np.maximum(np.einsum("bii->i", each), 1e-300))
+        each, scores = each * np.outer(scale, scale), gradient[shown][:, self.free] * scale
+        factor, inverse = 1.0, np.full_like(np.outer(scale, scale), np.inf)
         try:
-            factor = _leveraged_inflation(each * np.outer(scale, scale), scores * scale)
-        except np.linalg.LinAlgError:  # the views don't tell all of them
-            factor = 1.0
-        inside = np.ix_(self.free, self.free)
-        total = np.asarray(lens_bundle.lens_information(bundle.blocks, jnp.asarray(self.free)))
-        scale = 1 / np.sqrt(np.maximum(np.diag(total[inside]), 1e-300))
+            inverse = np.linalg.inv(each.sum(axis=0))
+            factor = _leveraged_inflation(each, scores / sigma_px)
+        except np.linalg.LinAlgError:  # not all of them are determined
+            pass
+        if not np.all(np.diag(inverse) > 0):
+            inverse[:] = np.inf
         covariance = np.zeros((COUNT, COUNT))
-        try:
-            inverse = np.linalg.inv(total[inside] * np.outer(scale, scale))
-            covariance[inside] = factor * sigma_px**2 * inverse * np.outer(scale, scale)
-        except np.linalg.LinAlgError:
-            covariance[inside] = np.inf
-        if not np.all(np.diag(covariance[inside]) > 0):
-            covariance[inside] = np.inf
+        inside = np.ix_(self.free, self.free)
+        covariance[inside] = factor * sigma_px**2 * inverse * np.outer(scale, scale)
         return factor, covariance
 
 
@@ -285,7 +274,7 @@ def _posed_anew(
 def _leveraged_inflation(
     information: Float[np.ndarray, "V p p"], scores: Float[np.ndarray, "V p"]
 ) -> float:
-    """The factor of the variances where few views tell much each; 1 if it is not noticed.
+    """The factor of the variances where few views weigh much each; 1 if it is not noticed.
 
     A view draws the solution towards itself, by its share of the information, so its score is
     smaller than its error: each is divided by the root of what is left of it. Of independent noise

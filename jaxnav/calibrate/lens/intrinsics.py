@@ -19,7 +19,6 @@ from jaxnav.calibrate.lens import choice
 from jaxnav.calibrate.lens.checks import advice, findings, reach, rim_sigma_px, tilts_deg
 from jaxnav.calibrate.lens.fit import LensFit, fit_lens
 from jaxnav.calibrate.lens.start import lens_start
-from jaxnav.core.models.camera import Camera
 from jaxnav.errors import BadInput
 
 _FEWEST_VIEWS = 5
@@ -44,7 +43,7 @@ _TILT = "tilt the board by 30 to 45 deg, to all sides, in 20 to 40 views"
 # Sigmas of the corners' noise from which on a coefficient makes unseen views better, not worse.
 # Source: Akaike (1974), "A new look at the statistical model identification".
 _WORTH = 2**0.5
-_GROWN = 1.01  # times the error of unseen views: more says that it was needed
+_GROWN = 1.01  # times the error of unseen views: more means that it was needed
 _LAST_FIRST = {
     "none": (),
     "radtan": ("k3", "k2", "k1"),
@@ -58,10 +57,6 @@ _STAYS = 0.1  # in sigmas, of every parameter
 Stage = Callable[[str], None]  # called with a word for every stage
 
 
-def _silent(stage: str) -> None:
-    """Show no progress."""
-
-
 @dataclass(frozen=True)
 class LensCalibration:
     """A calibrated lens with its checks, its left-out views and advice."""
@@ -71,16 +66,11 @@ class LensCalibration:
     # any out
     held_out_px: dict[str, float]
     given: int  # number of views given
-    # view -> why it is not in the fit; views left out only because others tell more are not named
+    # view -> why it is not in the fit; views left out only because others are better are not named
     left_out: dict[str, str]
     downweighted: dict[str, float]  # view -> its weight, for views that count less than the others
     findings: tuple[str, ...]  # lines about what is wrong or was held at zero
     advice: tuple[str, ...]  # lines about what to collect next
-
-    @property
-    def camera(self) -> Camera:
-        """The calibrated camera, in the process's precision."""
-        return self.fit.camera
 
 
 def calibrate_images(
@@ -88,7 +78,7 @@ def calibrate_images(
     sources: Sequence[Path],
     lens: str = "auto",
     max_views: int = 100,
-    stage: Stage = _silent,
+    stage: Stage = lambda _: None,
     bar: Bar = lambda items, **_: items,
 ) -> tuple[CollectedViews, LensCalibration]:
     """Collect the views of the board from images, and calibrate the lens from them.
@@ -122,10 +112,10 @@ def calibrate_images(
             if np.all(np.abs(last.parameters - before.parameters) <= _STAYS * before.sigma):
                 break
     collected = collect_views(board, sources, before.camera if before else None, bar=bar)
-    gone = {name: f"the same picture as {twin}" for name, twin in collected.duplicates}
-    gone |= dict(collected.unreadable)
-    gone |= dict.fromkeys(collected.without_board, "the board is not seen")
-    return collected, calibrate_lens(collected.views, lens, max_views, where, stage, gone)
+    unusable = {name: f"the same picture as {twin}" for name, twin in collected.duplicates}
+    unusable |= dict(collected.unreadable)
+    unusable |= dict.fromkeys(collected.without_board, "the board is not seen")
+    return collected, calibrate_lens(collected.views, lens, max_views, where, stage, unusable)
 
 
 def calibrate_lens(
@@ -133,23 +123,23 @@ def calibrate_lens(
     lens: str = "auto",
     max_views: int = 100,
     where: str = "the views",
-    stage: Stage = _silent,
-    gone: Mapping[str, str] = MappingProxyType({}),
+    stage: Stage = lambda _: None,
+    unusable: Mapping[str, str] = MappingProxyType({}),
 ) -> LensCalibration:
     """Calibrate the lens that explains the views best.
 
     Args:
         lens: one of `bundle.FITTED`, or "auto" for that of `bundle.TRIED` best at unseen views.
-        max_views: the most views to fit; those that tell most are taken.
+        max_views: the most views to fit; the most informative are taken.
         where: the source of the views as the user gave it, for messages.
         stage: called with a word for every stage.
-        gone: image -> why it gave no view, for messages.
+        unusable: image -> why it gave no view, for messages.
 
     Raises:
         BadInput: the views don't determine focal length or centre, or show another board.
     """
     good, left_out = screened(views)
-    _require_views(good, {**left_out, **gone}, where)
+    _require_views(good, {**left_out, **unusable}, where)
     lenses = lens_bundle.TRIED if lens == "auto" else (lens,)
     stage("start")
     starts = {one: lens_start(good, one) for one in lenses}
@@ -178,13 +168,16 @@ def calibrate_lens(
         best = choice.best_lens(fits, errors, drawn)
     stage("check")
     _require_sound(fits[best], where)
-    better = min(errors, key=lambda one: errors[one].rms_px, default=best)
+    better = min(errors, key=lambda one: choice.rms(errors[one]), default=best)
     if better != best and not choice.clearly_better(errors[better], errors[best]):
         better = best
     fit = _undetermined_held(fits[best], stage)
     _require_observed(fit, better, where)
+    downweighted: dict[str, float] = {}
     for view, weight, sigma_px in zip(good.views, fit.view_weights, fit.view_sigma_px, strict=True):
-        if weight == 0:
+        if 0 < weight < 1:
+            downweighted[view.name] = float(weight)
+        elif weight == 0:
             left_out[view.name] = (
                 f"its corners are {sigma_px:.2g} px off, {sigma_px / fit.sigma_px:.0f} times as "
                 "far as the others': did the board bend, or move?"
@@ -193,14 +186,10 @@ def calibrate_lens(
             )
     return LensCalibration(
         fit=fit,
-        held_out_px={one: error.rms_px for one, error in errors.items()},
+        held_out_px={one: choice.rms(error) for one, error in errors.items()},
         given=len(views.views),
         left_out=left_out,
-        downweighted={
-            view.name: float(weight)
-            for view, weight in zip(good.views, fit.view_weights, strict=True)
-            if 0 < weight < 1
-        },
+        downweighted=downweighted,
         findings=findings(fit, better),
         advice=advice(fit),
     )
@@ -236,7 +225,7 @@ def _same(one: BoardView, other: BoardView) -> bool:
 
 
 def _undetermined_held(fit: LensFit, stage: Stage) -> LensFit:
-    """Refit the lens with coefficients at zero that the corners don't tell from it.
+    """Refit the lens with coefficients at zero that the corners don't determine.
 
     Such a coefficient is not worth its noise, unseen views do without it, and the image's border is
     not known with it. The sigmas are those of the lens with all of them: none is known better for
@@ -254,7 +243,7 @@ def _undetermined_held(fit: LensFit, stage: Stage) -> LensFit:
         stage(f"hold {name}")
         held = fit_lens(fit.views, fit.lens, (*fit.fixed, name), fit.parameters)
         weights = fit.weights * held.weights
-        before, after = (choice.held_out(one, weights).rms_px for one in (fit, held))
+        before, after = (choice.rms(choice.held_out_px(one, weights)) for one in (fit, held))
         if not after < _GROWN * before:
             break
         fit = held

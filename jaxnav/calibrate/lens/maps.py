@@ -51,7 +51,8 @@ def grid_px(image_size_px: tuple[int, int]) -> Float[np.ndarray, "h w 2"]:
 def projection_sigma(fit: LensFit) -> ImageMap:
     """One standard deviation of where a ray is drawn, along x and y, px."""
     pixels = grid_px(fit.views.image_size_px)
-    by_lens, by_turn, drawn = ray_slopes(fit.lens, fit.parameters, pixels.reshape(-1, 2))
+    slopes = ray_slopes(fit.lens, fit.parameters, pixels.reshape(-1, 2))
+    by_lens, by_turn, drawn = jax.device_get(slopes)
     # What a turn of the camera explains is no error of the lens.
     J, turns = by_lens.reshape(-1, by_lens.shape[-1]), by_turn.reshape(-1, 3)
     seen = np.repeat(drawn, 2)
@@ -62,16 +63,12 @@ def projection_sigma(fit: LensFit) -> ImageMap:
     return ImageMap(pixels, sigma_px.reshape(pixels.shape))
 
 
+@partial(jax.jit, static_argnames="lens")
 def ray_slopes(
-    lens: str, parameters: Float[np.ndarray, " 9"], pixels: Float[np.ndarray, "N 2"]
-) -> tuple[Float[np.ndarray, "N 2 9"], Float[np.ndarray, "N 2 3"], Bool[np.ndarray, " N"]]:
+    lens: str, parameters: Float[Array, " 9"], pixels: Float[Array, "N 2"]
+) -> tuple[Float[Array, "N 2 9"], Float[Array, "N 2 3"], Bool[Array, " N"]]:
     """Slopes of the pixels of fixed rays by the nine parameters, and by a turn of the camera; and
     whether the lens draws the ray of a pixel there."""
-    return jax.device_get(_slopes(lens, jnp.asarray(parameters), jnp.asarray(pixels)))
-
-
-@partial(jax.jit, static_argnames="lens")
-def _slopes(lens: str, parameters: Array, pixels: Array) -> tuple[Array, Array, Array]:
     rays = lens_bundle.camera_of(lens, parameters).unproject(pixels)
 
     def draw(parameters: Array, turn: Array) -> Array:
@@ -98,14 +95,15 @@ def _difference(one: Camera, other: Camera, pixels: Array) -> Array:
     def shift(turn: Array) -> Array:
         return other.project(_turned(rays, turn)) - pixels
 
-    turn = jnp.zeros(3, pixels.dtype)
-    for _ in range(_STEPS):
+    def step(_: int, turn: Array) -> Array:
         residual, J = shift(turn), jax.jacfwd(shift)(turn)
         # Rays that are drawn very differently count less: they are of the border.
         weight = drawn / (1 + jnp.sum(residual**2, axis=1))
         H = jnp.einsum("nci,n,ncj->ij", J, weight, J)
         g = jnp.einsum("nci,n,nc->i", J, weight, residual)
-        turn = turn - jnp.linalg.solve(H, g)
+        return turn - jnp.linalg.solve(H, g)
+
+    turn = jax.lax.fori_loop(0, _STEPS, step, jnp.zeros(3, pixels.dtype))
     seen = drawn & other.in_front(_turned(rays, turn))
     return jnp.where(seen[:, None], shift(turn), jnp.nan)
 

@@ -2,16 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from jaxnav.calibrate.board.views import BoardView, BoardViews
+from jaxnav.calibrate.board.views import BoardView, BoardViews, unproject
 from jaxnav.core.models.camera import Camera
-from jaxnav.core.models.geometry import transform_points
 
-_unprojected = jax.jit(Camera.unproject)
 _FACING = np.diag([1.0, -1.0, -1.0])  # R_camera_board of a board that hangs upright, seen head-on
 
 
@@ -50,7 +47,7 @@ def simulated_views(
     poses: list[np.ndarray] = []
     while len(views) < count:
         middle_px = size / 2 + reach * rng.uniform(-0.5, 0.5, 2) * size
-        sight = np.asarray(_unprojected(camera, jnp.asarray(middle_px)))
+        sight = np.asarray(unproject(camera, jnp.asarray(middle_px)))
         R_camera_board = _orientation(sight, most_tilt_deg, rng)
         wxyz = np.roll(Rotation.from_matrix(R_camera_board).as_quat(), 1)
         pose = np.concatenate([wxyz, sight * rng.uniform(*distances_m)])
@@ -74,20 +71,17 @@ def seen_from(
     Args:
         T_camera_board: (7,) wxyz_xyz.
     """
-    pose = jaxlie.SE3(jnp.asarray(T_camera_board))
-    corners_px, seen, facing = jax.device_get(_projected(camera, pose, jnp.asarray(points_board_m)))
+    R_camera_board = Rotation.from_quat(np.roll(T_camera_board[:4], -1)).as_matrix()
+    points_camera = points_board_m @ R_camera_board.T + T_camera_board[4:]
+    corners_px, in_front = jax.device_get(_drawn(camera, points_camera))
     within = np.all((corners_px >= 0) & (corners_px <= np.array(image_size_px) - 1), axis=1)
-    return corners_px, within & seen & facing
+    facing = points_camera @ R_camera_board[:, 2] < 0
+    return corners_px, within & in_front & facing
 
 
 @jax.jit
-def _projected(
-    camera: Camera, T_camera_board: jaxlie.SE3, points_board: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    points_camera = transform_points(T_camera_board, points_board)
-    normal_camera = T_camera_board.rotation().as_matrix()[:, 2]
-    facing = jnp.sum(points_camera * normal_camera[None], axis=1) < 0
-    return camera.project(points_camera), camera.in_front(points_camera), facing
+def _drawn(camera: Camera, points_camera: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return camera.project(points_camera), camera.in_front(points_camera)
 
 
 def _orientation(sight: np.ndarray, most_tilt_deg: float, rng: np.random.Generator) -> np.ndarray:

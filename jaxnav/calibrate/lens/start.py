@@ -6,15 +6,13 @@ lengths without distortion are tried as well, and the guess with the least media
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 
 import cv2
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxnav.calibrate.board.views import BoardView, BoardViews, pose_from_rays
+from jaxnav.calibrate.board.views import BoardView, BoardViews, pose_from_rays, unproject
 from jaxnav.calibrate.lens import bundle as lens_bundle
 
 _FOCALS = np.geomspace(0.2, 3.0, 14)  # in image widths: 140 degrees and more, to a tele lens
@@ -54,17 +52,13 @@ def board_poses(
     Source: Collins and Bartoli (2014), "Infinitesimal plane-based pose estimation", by OpenCV.
     """
     corners_px = jnp.asarray(lens_bundle.padded_corners(views).corners_px)
-    rays = np.asarray(_rays(lens, jnp.asarray(parameters), corners_px))
+    camera = lens_bundle.camera_of(lens, jnp.asarray(parameters, float))
+    rays = np.asarray(unproject(camera, corners_px))
     poses = [
         pose_from_rays(views.points_board_m[view.ids], rays[row, view.ids])
         for row, view in enumerate(views.views)
     ]
     return np.reshape(poses, (-1, 7))
-
-
-@partial(jax.jit, static_argnames="lens")
-def _rays(lens: str, parameters: Array, corners_px: Array) -> Array:
-    return lens_bundle.camera_of(lens, parameters).unproject(corners_px)
 
 
 def _misfit_px(views: BoardViews, lens: str, parameters: np.ndarray) -> float:

@@ -29,37 +29,27 @@ from jaxnav.calibrate.odometry.drive import (
     reading_sigma,
 )
 from jaxnav.calibrate.odometry.fit import OdometryFit, Prior, fit
-from jaxnav.calibrate.odometry.model import FULL_WEIGHT, NAMES, Model
+from jaxnav.calibrate.odometry.model import NAMES, Model
 from jaxnav.calibrate.odometry.start import LOOSE, TIGHT, start
-from jaxnav.calibrate.parts import variance_inflation
+from jaxnav.calibrate.robust import FAR, variance_inflation
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
 
 _CIRCLES = "drive circles at full lock both ways"
-# The largest accepted sigma of each parameter, relative to it or in its unit, and what to do where
-# it is larger. Of two that can't be told apart, the first here stays as it was: measured by tape,
-# or less vital.
+_UNSURE = "the drive does not tell it:"
+# What to do where a parameter's sigma is larger than accepted. Of two that can't be told apart, the
+# first here stays as it was: measured by tape, or less vital. Without the last there is nothing.
 _LEAST_SURE = {
-    "wheelbase_m": (
-        0.02,
-        True,
-        f"steering gain and wheelbase can't be told apart: {_CIRCLES}, or measure the wheelbase "
-        "with a tape",
-    ),
-    "camera_delay_s": (
-        0.01,
-        False,
-        "the drive does not tell it: stop and start more often in view of a marker",
-    ),
-    "steering_gain": (0.02, True, f"the drive does not tell it: {_CIRCLES}, near a marker"),
-    "steering_offset_rad": (
-        0.01,
-        False,
-        "the drive does not tell it: drive longer in view of a marker",
-    ),
-    "speed_scale": (0.02, True, ""),  # without it there is nothing
+    "wheelbase_m": f"steering gain and wheelbase can't be told apart: {_CIRCLES}, or measure the "
+    "wheelbase with a tape",
+    "camera_delay_s": f"{_UNSURE} stop and start more often in view of a marker",
+    "steering_gain": f"{_UNSURE} {_CIRCLES}, near a marker",
+    "steering_offset_rad": f"{_UNSURE} drive longer in view of a marker",
+    "speed_scale": "",
 }
+_ABSOLUTE = ("camera_delay_s", "steering_offset_rad")
+_ACCEPTED, _ACCEPTED_RELATIVE = 0.01, 0.02  # sigma, in s or rad, and over the value
 _STEERED_LITTLE = (
     "the steering hardly changed while the car moved: drive eights, at full lock both ways, to "
     "find it"
@@ -68,12 +58,12 @@ _TURNED_LITTLE = f"the car hardly turned: {_CIRCLES} to find it"
 _CHANGED_LITTLE = "neither speed nor steering changed: stop and start, or drive eights, to find it"
 _GIVEN = "as given by --fix"
 _VARIED_RAD, _VARIED_MPS = 0.03, 0.03  # below, noise could pass for steering or driving
-_VARIED_SHARE = 0.2  # of the speed: a single start tells little about the delay
+_VARIED_SHARE = 0.2  # of the speed: a single start shows little of the delay
 _ASIDE_RAD = 0.05  # at a constant steering this far from straight, gain and offset are one
 _BLOCK = 15  # readings to average, some 0.3 s
 _GAIN_SIGMA = 0.1  # of a gain that was kept, for its effect on the offset's sigma
 _LEAST_WAY_M = 1.0
-_NOTICED = 1.5  # a smaller inflation counts as none: 20 parts tell no better
+_NOTICED = 1.5  # a smaller inflation counts as none: 20 parts can't show it
 _REFUSED_CHI2, _AGAIN_CHI2 = 4.0, 1.2  # per degree of freedom
 _MOST_OUTLIERS, _AGAIN_OUTLIERS = 0.3, 0.05
 _OTHER = (0.1, TIGHT, TIGHT)  # errors of the odometry, for further starts
@@ -152,8 +142,14 @@ def calibrate_odometry(
         free = np.array([name not in why for name in NAMES])
         return fit(model, nodes, theta, free, prior, progress)
 
+    fits: dict[bytes, OdometryFit] = {}  # several errors may lead to the same start
+
     def started(theta: np.ndarray, error: float) -> OdometryFit:
-        return fitted(start(course, rig, markers, theta, error), theta)
+        nodes = start(course, rig, markers, theta, error)
+        key = nodes.tobytes() + theta.tobytes()
+        if key not in fits:
+            fits[key] = fitted(nodes, theta)
+        return fits[key]
 
     try:
         solution = started(theta, LOOSE)
@@ -173,7 +169,7 @@ def calibrate_odometry(
                     "and around a marker, in view of the cameras"
                 )
                 raise BadInput(where, problem)
-            why[name] = _LEAST_SURE[name][2]
+            why[name] = _LEAST_SURE[name]
             kept = np.array([name in why for name in NAMES])
             solution = fitted(solution.nodes, np.where(kept, theta, solution.theta))
             chi2, outliers = _chi2_per_dof(solution, course)
@@ -262,8 +258,8 @@ def _undetermined(
 def _chi2_per_dof(solution: OdometryFit, course: Course) -> tuple[float, np.ndarray]:
     """Chi-square per degree of freedom, and which views are outliers, which count in neither."""
     chi2 = solution.blocks.view_chi2
-    outliers = chi2 > FULL_WEIGHT
-    extra = float(np.sum(FULL_WEIGHT * (1 + np.log(chi2[outliers] / FULL_WEIGHT))))
+    outliers = chi2 > FAR
+    extra = float(np.sum(FAR * (1 + np.log(chi2[outliers] / FAR))))
     dof = 8 * int(np.sum(~outliers)) - 3 * course.stretches - len(solution.information)
     return (float(solution.blocks.cost) - extra) / max(dof, 1), outliers
 
@@ -275,12 +271,13 @@ def _least_sure(solution: OdometryFit, fixed: Mapping[str, str], scale: float) -
     sigma, shows which can't be told apart.
     """
     free = [name for name in NAMES if name not in fixed]
-    values = dict(zip(NAMES, solution.theta, strict=True))
-    largest = {
-        name: sigma * (abs(values[name]) if relative else 1.0)
-        for name, (sigma, relative, _) in _LEAST_SURE.items()
-    }
-    asked = np.array([largest[name] for name in free])
+    asked = np.array(
+        [
+            _ACCEPTED if name in _ABSOLUTE else _ACCEPTED_RELATIVE * abs(value)
+            for name, value in zip(NAMES, solution.theta, strict=True)
+            if name in free
+        ]
+    )
     weakest, directions = np.linalg.eigh(solution.information * np.outer(asked, asked) / scale)
     if not len(free) or weakest[0] >= 1.0:
         return None

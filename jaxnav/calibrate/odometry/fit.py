@@ -21,7 +21,7 @@ _LOCAL = NODE + NEXT  # unknowns of the nodes in an interval: side by side, from
 _RTOL = 1e-9
 _MOST_STEPS = 100
 _PARTS = 20  # of a course, compared with each other
-_HOLDS = 1e-9  # of a pose that nothing tells of, as the last of a stretch before its first view
+_HOLDS = 1e-9  # of a pose that nothing determines, as the last of a stretch before its first view
 
 
 class Prior(NamedTuple):

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Shaped
 
 from jaxnav.calibrate.odometry.drive import Course, Intervals, MarkerViews, ReadingSigma
+from jaxnav.calibrate.robust import sighting_cost, sighting_weight
 from jaxnav.core.models.geometry import T_world_vehicle_from_planar, transform_points
 from jaxnav.core.models.markers import MarkerMap
 from jaxnav.core.models.rig import CameraRig
@@ -30,8 +31,6 @@ NAMES = ("speed_scale", "steering_gain", "steering_offset_rad", "wheelbase_m", "
 # turns between two readings. It is well below the effect of the noise of usual readings, so it
 # matters little if their sigmas are right.
 SLIP_PER_SQRT_S = (5e-4, 3e-4, 1e-3)
-# A view counts in full up to the 99.9th percentile of chi-square with 8 degrees of freedom.
-FULL_WEIGHT = 26.1
 NODE, NEXT = 5, 3  # unknowns of an interval: of its node, and of the next node; then parameters
 _PADDED = 512  # sizes are rounded up, so that drives of about one length share a program
 
@@ -81,15 +80,8 @@ class Model:
         )
 
 
-def view_weights(chi2: Float[Array | np.ndarray, " V"]) -> Float[Array, " V"]:
-    """The weights of views: 1 up to `FULL_WEIGHT`, beyond it `FULL_WEIGHT` / chi2."""
-    return jnp.where(chi2 <= FULL_WEIGHT, 1.0, FULL_WEIGHT / jnp.maximum(chi2, FULL_WEIGHT))
-
-
 def corrected(
-    theta: Float[Array, " 5"],
-    speed_mps: Float[Array, "*N"],
-    steering_rad: Float[Array, "*N"],
+    theta: Float[Array, " 5"], speed_mps: Float[Array, "*N"], steering_rad: Float[Array, "*N"]
 ) -> tuple[Float[Array, "*N"], Float[Array, "*N"]]:
     """Correct the speed and steering of a reading by the parameters."""
     return theta[0] * speed_mps, theta[1] * steering_rad + theta[2]
@@ -177,14 +169,12 @@ def _blocks(
     Jv, px = jax.vmap(jax.jacfwd(seen, has_aux=True))(local[index], at, views)
     rv = px / jnp.repeat(views.sigma_px, 2, axis=1)
     chi2 = jnp.sum(rv**2, axis=1)
-    weight = jnp.where(used, view_weights(chi2), 0.0)
-    beyond = 1 + jnp.log(jnp.maximum(chi2, FULL_WEIGHT) / FULL_WEIGHT)
-    rho = jnp.where(chi2 <= FULL_WEIGHT, chi2, FULL_WEIGHT * beyond)
+    weight = jnp.where(used, sighting_weight(chi2), 0.0)
     information = information.at[index].add(
         jnp.einsum("vri,vrj->vij", Jv * weight[:, None, None], Jv)
     )
     gradient = gradient.at[index].add(jnp.einsum("vri,vr->vi", Jv, rv * weight[:, None]))
-    cost = jnp.sum(r**2) + jnp.sum(jnp.where(used, rho, 0.0))
+    cost = jnp.sum(r**2) + jnp.sum(jnp.where(used, sighting_cost(chi2), 0.0))
     return cost, information, gradient, chi2, px.reshape(-1, 4, 2)
 
 

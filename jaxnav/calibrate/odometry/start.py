@@ -88,7 +88,12 @@ def _branches(
     """(V, 3): one of the two poses of each view, by the least total cost; and (V,), true where it
     fits one of its neighbours."""
     views = course.views
-    poses, cost = _both_poses(views, rig, markers)
+    columns = jax.tree.map(jnp.asarray, MarkerViews(*padded(views)))
+    both = jax.device_get(_poses_of_views(rig, markers, columns))
+    poses, distance = (column[: len(views.camera)] for column in both)
+    cost = np.sum(distance**2, axis=2)
+    cost = np.where(np.isfinite(cost), np.minimum(cost, _MOST), _MOST)
+    poses = np.where(np.isfinite(poses), poses, 0.0)
     at = np.column_stack([np.interp(views.time_s - theta[4], times_s, c) for c in driven.T])
     new = np.concatenate([[True], np.diff(views.first) != 0])
     total, came = cost[0], np.zeros((len(at), 2), int)
@@ -110,18 +115,6 @@ def _branches(
     following = np.concatenate([step_costs[1:], [_MOST]])
     good = (own < _MOST) & (np.minimum(step_costs, following) < _MOST / 2)
     return poses[rows, ways], good
-
-
-def _both_poses(
-    views: MarkerViews, rig: CameraRig, markers: MarkerMap
-) -> tuple[np.ndarray, np.ndarray]:
-    """(V, 2, 3) planar poses of the vehicle, and (V, 2) the costs of their corner residuals."""
-    columns = jax.tree.map(jnp.asarray, MarkerViews(*padded(views)))
-    poses, distance = jax.device_get(_poses_of_views(rig, markers, columns))
-    count = len(views.camera)
-    cost = np.sum(distance[:count] ** 2, axis=2)
-    cost = np.where(np.isfinite(cost), np.minimum(cost, _MOST), _MOST)
-    return np.where(np.isfinite(poses[:count]), poses[:count], 0.0), cost
 
 
 @jax.jit

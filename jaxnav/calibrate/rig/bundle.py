@@ -1,8 +1,4 @@
-"""Bundle adjustment of a moving rig: the poses of all frames, of the cameras and of the markers.
-
-A sighting whose corners lie further off than noise explains counts less the further off it is: its
-cost grows as the logarithm, so that wrong sightings hardly pull.
-"""
+"""Bundle adjustment of a moving rig: the poses of all frames, of the cameras and of the markers."""
 
 from functools import partial
 from typing import Any
@@ -18,14 +14,12 @@ from scipy import stats
 
 from jaxnav.calibrate.lens.bundle import retracted
 from jaxnav.calibrate.rig.views import RigViews
-from jaxnav.core.linalg.schur import Blocks, ReducedSystem, SchurLM, reduce
+from jaxnav.calibrate.robust import sighting_cost, sighting_weight
+from jaxnav.calibrate.schur import Blocks, ReducedSystem, SchurLM, reduce
 from jaxnav.core.linalg.small_matrices import cho_solve, cholesky, solve_upper
 from jaxnav.core.models.camera import Camera
 from jaxnav.core.models.geometry import rotation_matrix, skew
 from jaxnav.core.models.rig import CameraRig
-
-# A sighting has eight coordinates; with Gaussian noise one sighting in a thousand is further off.
-FAR = float(stats.chi2.ppf(0.999, 8))
 
 # The search ends when a step promises less than this of the cost, which is 1 a coordinate: every
 # unknown is within a few hundredths of its sigma then.
@@ -131,7 +125,7 @@ def adjust(
     return Adjusted(
         poses=solution.value,
         residuals_px=residuals,
-        weight=_weight(_distance2(residuals, known.sigma_px)),
+        weight=sighting_weight(_chi2(residuals, known)),
         reduced=reduced,
         scores=_scores(solution.value, known, solution.state.normal, parts),
         frames_follow=-jax.vmap(solve_upper)(reduced.factor, reduced.carried),
@@ -157,6 +151,12 @@ def moved(poses: RigUnknowns, own: Float[Array, "F 6"], shared: Float[Array, " R
 def reprojection_residuals_px(poses: RigUnknowns, known: RigSightings) -> Float[Array, "N 4 2"]:
     """Residuals of the corners, projected minus observed."""
     return _looked_at(poses, known)[0]
+
+
+@jax.jit
+def costs(poses: RigUnknowns, known: RigSightings) -> Float[Array, " N"]:
+    """The cost of every sighting."""
+    return sighting_cost(_chi2(_looked_at(poses, known)[0], known))
 
 
 def residuals_and_blocks(
@@ -218,8 +218,8 @@ def _linearised(poses: RigUnknowns, known: RigSightings) -> tuple[Array, Array, 
     in_camera, in_vehicle = points
     R_camera_vehicle, R_camera_marker = Rs
     N = residuals.shape[0]
-    distance2 = _distance2(residuals, known.sigma_px)
-    scale = jnp.sqrt(_weight(distance2)) / known.sigma_px
+    chi2 = _chi2(residuals, known)
+    scale = jnp.sqrt(sighting_weight(chi2)) / known.sigma_px
     D = slopes * scale[:, None, None, None]  # (N, 4, 2, 3) per m in the camera
 
     def twist(D: Array, points: Array) -> Array:
@@ -236,7 +236,7 @@ def _linearised(poses: RigUnknowns, known: RigSightings) -> tuple[Array, Array, 
     if poses.lenses.shape[0]:
         J_lens = lens_slopes.reshape(N, 8, 12) * scale[:, None, None]
         shared += [J_lens[..., :6], J_lens[..., 6:]]
-    return _loss(distance2), r, J_frame, jnp.stack(shared, axis=1)
+    return sighting_cost(chi2), r, J_frame, jnp.stack(shared, axis=1)
 
 
 def _looked_at(
@@ -272,27 +272,11 @@ def _looked_at(
     return residuals, (in_camera, in_vehicle), (slopes[0], slopes[1]), (R_cv, R_cm)
 
 
-def _distance2(residuals: Float[Array, "N 4 2"], sigma_px: Array) -> Float[Array, " N"]:
-    return jnp.sum(residuals**2, axis=(1, 2)) / sigma_px**2
-
-
-def _loss(distance2: Array) -> Array:
-    """The square up to `FAR`, then a logarithm, with a continuous derivative."""
-    return jnp.where(
-        distance2 < FAR, distance2, FAR * (1 + jnp.log(jnp.maximum(distance2, FAR) / FAR))
-    )
-
-
-def _weight(distance2: Array) -> Array:
-    return jnp.minimum(1, FAR / jnp.maximum(distance2, FAR))
+def _chi2(residuals: Float[Array, "N 4 2"], known: RigSightings) -> Float[Array, " N"]:
+    return jnp.sum(residuals**2, axis=(1, 2)) / known.sigma_px**2
 
 
 def sigma_px_of(residuals_px: Float[np.ndarray, "N 4 2"]) -> float:
     """Standard deviation of a corner's coordinate; up to a fourth of the sightings may be wrong."""
     distance2 = np.sum(residuals_px**2, axis=(1, 2))
     return float(np.sqrt(np.quantile(distance2, _QUANTILE) / stats.chi2.ppf(_QUANTILE, 8)))
-
-
-def losses(residuals_px: Float[np.ndarray, "N 4 2"], sigma_px: float) -> Float[np.ndarray, " N"]:
-    """(N,) the cost of every sighting."""
-    return np.asarray(_loss(_distance2(jnp.asarray(residuals_px), jnp.asarray(sigma_px))))

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxnav.calibrate.parts import variance_inflation
 from jaxnav.calibrate.rig import bundle
 from jaxnav.calibrate.rig.linking import Linker, Links
 from jaxnav.calibrate.rig.views import (
@@ -25,6 +24,7 @@ from jaxnav.calibrate.rig.views import (
     rays_camera,
     wxyz_xyz,
 )
+from jaxnav.calibrate.robust import variance_inflation
 from jaxnav.core.models.camera import LENS_COEFFICIENTS, Camera
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.errors import BadInput
@@ -35,7 +35,7 @@ _ROUNDS, _STEPS = 8, 30
 _BETTER = 1.0  # a pose is replaced if another lowers its cost by more than this
 _TRIES = 10  # sightings of a marker that propose its pose
 _PARTS = 40  # of a recording, compared with each other
-_NOTICED = 1.3  # a smaller inflation of the variances counts as none: 40 parts tell no better
+_NOTICED = 1.3  # a smaller inflation of the variances counts as none: 40 parts can't show it
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ def _other_branches(
     say how many have moved.
 
     A frame has two possible poses, and a marker two for each of some sightings. A search that
-    begins at a mirrored pose ends there, and only a comparison of costs tells.
+    begins at a mirrored pose ends there, and only a comparison of costs shows it.
     """
     C, linker, links = len(rig), start.linker, start.links
     views, M = linker.views, len(linker.views.size_m)
@@ -241,8 +241,7 @@ def _other_branches(
     known = bundle.seen(rig, views, sigma_px)
 
     def cost(of: bundle.RigUnknowns, groups: np.ndarray, count: int) -> np.ndarray:
-        residuals = np.asarray(bundle.reprojection_residuals_px(of, known))
-        return np.bincount(groups, bundle.losses(residuals, float(known.sigma_px)), count)
+        return np.bincount(groups, bundle.costs(of, known), count)
 
     def best_of(
         of: bundle.RigUnknowns, name: str, groups: np.ndarray, tries: Iterable[np.ndarray]

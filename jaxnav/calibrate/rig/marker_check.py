@@ -21,7 +21,7 @@ from jaxnav.files.poses import transform
 _SIGMAS = 3.0  # deviations up to this many sigmas may be noise
 _WRONG_SIZE = 0.05  # relative error of the side that paper and print don't explain
 _MOVED = 0.2  # part of a marker's sightings that must disagree with the others for a move
-_FEW = 8  # fewer sightings tell neither a size nor a second place
+_FEW = 8  # of fewer sightings neither a size nor a second place is found
 _AGREE_RAD = 0.02  # largest angle between a ray and its corner for a sighting of the same place
 _STEPS = 30
 
@@ -72,7 +72,7 @@ def checked(
     """
     C = len(rig)
     linked = [index for index in given if calibration.mapped[index]]
-    T_map_world, agree = _laid_over(
+    T_map_world, agree = _aligned(
         np.stack([given[index] for index in linked]),
         calibration.Ts_world_marker[linked],
         calibration.views.size_m[linked],
@@ -110,7 +110,7 @@ def sizes_m(calibration: RigCalibration, views: RigViews, rig: CameraRig) -> dic
     return {index: size for index, size in sizes.items() if size is not None}
 
 
-def _laid_over(
+def _aligned(
     given: np.ndarray,
     Ts_world_marker: np.ndarray,
     size_m: np.ndarray,

@@ -9,12 +9,10 @@ does not slide sideways, and the wheels' speed is that of the reference point al
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -37,6 +35,8 @@ _LEAST_SPREAD = 1e-5  # m and rad: nothing is known better than this
 # The largest sigmas that are accepted.
 _SIGMA_M, _SIGMA_RAD = 0.02, np.deg2rad(1)
 _NAMES = ("x", "y", "heading", "speed scale", "steering offset", "steering gain")
+# On a straight line the gain could be anything: it stays within a factor of 20, so does the scale.
+_MOST = np.array([np.inf, np.inf, np.inf, 3.0, 1.0, 3.0])
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,6 @@ class DrivenFrame:
     # of the twist xi in T_rig_level * T_level_vehicle * exp(xi), from the drive's uncertainty
     # alone; for the ground's see `level_follows`
     covariance: Float[np.ndarray, "6 6"]
-    # Of the odometry, which had to be found with the frame: in a curve, a relative error of the
-    # gain moves the frame forward by that part of half the wheelbase.
-    speed_scale: float
-    steering_offset_rad: float
-    steering_gain: float
 
 
 def moved_to_places(
@@ -120,18 +115,6 @@ def _moved(
     )
 
 
-def moved_world(calibration: RigCalibration, move: Float[np.ndarray, "4 4"]) -> RigCalibration:
-    """Express a calibration in another world, in which `move` is the pose of the present one.
-
-    Covariances stay, as twists are body-fixed.
-    """
-    return replace(
-        calibration,
-        Ts_world_marker=move @ calibration.Ts_world_marker,
-        Ts_world_vehicle=move @ calibration.Ts_world_vehicle,
-    )
-
-
 def adjoint(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
     """(6, 6) A in T exp(xi) = exp(A xi) T, twists ordered (translation, rotation)."""
     R, t = T[:3, :3], T[:3, 3]
@@ -164,6 +147,8 @@ def driven_frame(
     Raises:
         BadInput: the drive is too short, or does not determine the frame.
     """
+    read = np.isfinite(speed_mps) & np.isfinite(steering_rad)
+    odometry_s, speed_mps, steering_rad = odometry_s[read], speed_mps[read], steering_rad[read]
     T_rig_level, weight = _level(Ts_world_rig)
     flat = Ts_world_rig @ T_rig_level
     planar = np.stack(
@@ -178,8 +163,7 @@ def driven_frame(
         raise BadInput("--vehicle-frame drive", problem)
     ends_s = np.stack([stamps_s[first], stamps_s[last]], axis=1)
     pieces = _pieces(ends_s, odometry_s, speed_mps, steering_rad)
-    ends = jnp.asarray(planar[first]), jnp.asarray(planar[last])
-    x, covariance = _fitted(_Pairs(*ends, pieces, jnp.asarray(wheelbase_m)))
+    x, covariance = _fitted(*map(jnp.asarray, (planar[first], planar[last], pieces, wheelbase_m)))
     sigma = np.sqrt(np.diag(covariance))
     limits = np.array([_SIGMA_M, _SIGMA_M, _SIGMA_RAD])
     if not np.all(sigma[:3] < limits):
@@ -196,14 +180,7 @@ def driven_frame(
     alone = max(float(np.sum(weight**2)), 1 / len(first))
     whole[2, 2] = alone * (weight @ flat[:, 2, 3] ** 2)
     whole[3, 3] = whole[4, 4] = alone * (weight @ np.mean(flat[:, 2, :2] ** 2, axis=1))
-    return DrivenFrame(
-        T_rig_level,
-        turn,
-        whole,
-        speed_scale=float(np.exp(x[3])),
-        steering_offset_rad=float(x[4]),
-        steering_gain=float(np.exp(x[5])),
-    )
+    return DrivenFrame(T_rig_level, turn, whole)
 
 
 def level_follows(
@@ -268,7 +245,7 @@ def _pairs(stamps_s: np.ndarray, odometry_s: np.ndarray) -> tuple[np.ndarray, np
 
 def _pieces(
     ends_s: np.ndarray, odometry_s: np.ndarray, speed_mps: np.ndarray, steering_rad: np.ndarray
-) -> Float[Array, "P J 3"]:
+) -> Float[np.ndarray, "P J 3"]:
     """Speed, steering and duration of the pieces between readings that make up each pair."""
     rows = []
     for a, b in ends_s:
@@ -277,53 +254,64 @@ def _pieces(
         rows.append(np.stack([speed_mps[at], steering_rad[at], np.diff(cuts)], axis=1))
     longest = max(len(row) for row in rows)
     padded = [np.pad(row, ((0, longest - len(row)), (0, 0))) for row in rows]
-    return jnp.asarray(np.stack(padded))
+    return np.stack(padded)
 
 
-class _Pairs(NamedTuple):
-    """P pairs of level poses of the rig, x y psi, and the odometry in between."""
+def _fitted(*pairs: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Fit (x, y, heading, log speed scale, steering offset, log steering gain); with covariance.
 
-    first: Float[Array, "P 3"]
-    last: Float[Array, "P 3"]
-    pieces: Float[Array, "P J 3"]
-    wheelbase_m: Float[Array, ""]
-
-
-def _fitted(pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
-    """Fit (x, y, heading, log speed scale, steering offset, log steering gain); with covariance."""
-    best: tuple[float, np.ndarray, np.ndarray] | None = None
+    The odometry's errors are found as well: in a curve, a relative error of the gain moves the
+    frame forward by that part of half the wheelbase.
+    """
+    fits = []
     for heading in np.arange(4) * np.pi / 2:
-        x, sigma = jnp.zeros(6).at[2].set(heading), jnp.full(3, 0.01)
+        x, sigma = np.array([0, 0, heading, 0, 0, 0]), np.full(3, 0.01)
         for _ in range(3):
-            x, information, left = _solved(x, sigma, pairs)
-            spread = 1.4826 * np.median(np.abs(np.asarray(left)), axis=0)
-            sigma = jnp.asarray(np.maximum(spread, _LEAST_SPREAD))
-        cost = float(np.sum(np.log(np.asarray(sigma))))
-        if best is None or cost < best[0]:
-            best = cost, np.asarray(x), np.asarray(information)
-    assert best is not None  # there are four headings
-    return best[1], np.linalg.pinv(best[2])
+            x = least_squares(
+                lambda *at: np.asarray(_misfits(*at)[0]),
+                x,
+                lambda *at: np.asarray(_misfits(*at)[1]),
+                bounds=(-_MOST, _MOST),
+                x_scale="jac",
+                ftol=1e-12,
+                xtol=1e-12,
+                gtol=1e-12,
+                max_nfev=40,
+                args=(sigma, *pairs),
+            ).x
+            J, apart = np.asarray(_misfits(x, sigma, *pairs)[1]), np.asarray(_apart(x, *pairs))
+            sigma = np.maximum(1.4826 * np.median(np.abs(apart), axis=0), _LEAST_SPREAD)
+        fits.append((np.sum(np.log(sigma)), x, np.linalg.pinv(J.T @ J)))
+    _, x, covariance = min(fits, key=lambda fit: fit[0])
+    return x, covariance
 
 
 @jax.jit
-def _solved(x: Array, sigma: Array, pairs: _Pairs) -> tuple[Array, Array, Array]:
-    """The minimum near x, its information, and every pair's residuals in m and rad."""
+def _misfits(x: Array, sigma: Array, *pairs: Array) -> tuple[Array, Array]:
+    """Residuals (3 P,) of the pairs in sigmas, under Huber's loss, and their Jacobian (3 P, 6)."""
 
-    def misfits(x: Array, pairs: _Pairs) -> Array:
-        rows = _apart(x, pairs) / sigma[None]
-        # Huber's loss: wheels that slip pull, but no more the more they slip.
+    def misfits(x: Array) -> tuple[Array, Array]:
+        rows = (_apart(x, *pairs) / sigma[None]).ravel()
+        # Wheels that slip pull, but no more the more they slip.
         length = jnp.abs(rows)
         far = jnp.sqrt(jnp.maximum(2 * _FAR * length - _FAR**2, _FAR**2))
-        return jnp.where(length < _FAR, rows, jnp.sign(rows) * far)
+        rows = jnp.where(length < _FAR, rows, jnp.sign(rows) * far)
+        return rows, rows
 
-    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(rtol=1e-10, atol=1e-10)
-    x = optx.least_squares(misfits, solver, x, pairs, max_steps=100, throw=False).value
-    J = jax.jacfwd(misfits)(x, pairs).reshape(-1, x.shape[0])
-    return x, J.T @ J, _apart(x, pairs)
+    J, rows = jax.jacfwd(misfits, has_aux=True)(x)
+    return rows, J
 
 
-def _apart(x: Array, pairs: _Pairs) -> Float[Array, "P 3"]:
-    """Vehicle's pose at the end of each pair minus that by odometry: along, across, turned."""
+@jax.jit
+def _apart(
+    x: Array, firsts: Array, lasts: Array, pieces: Array, wheelbase_m: Array
+) -> Float[Array, "P 3"]:
+    """Vehicle's pose at the end of each pair minus that by odometry: along, across, turned.
+
+    Args:
+        firsts, lasts: (P, 3) level poses of the rig, x y psi.
+        pieces: (P, J, 3) the odometry in between, see `_pieces`.
+    """
 
     def of_vehicle(pose: Array) -> Array:
         c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
@@ -331,7 +319,7 @@ def _apart(x: Array, pairs: _Pairs) -> Float[Array, "P 3"]:
 
     def along(pose: Array, piece: Array) -> tuple[Array, None]:
         speed, steering = piece[0] * jnp.exp(x[3]), piece[1] * jnp.exp(x[5]) + x[4]
-        return advance_bicycle(pose, speed, steering, piece[2], pairs.wheelbase_m), None
+        return advance_bicycle(pose, speed, steering, piece[2], wheelbase_m), None
 
     def one(first: Array, last: Array, pieces: Array) -> Array:
         predicted, _ = jax.lax.scan(along, of_vehicle(first), pieces)
@@ -341,4 +329,4 @@ def _apart(x: Array, pairs: _Pairs) -> Float[Array, "P 3"]:
             [c * apart[0] + s * apart[1], c * apart[1] - s * apart[0], wrap_angle(apart[2])]
         )
 
-    return jax.vmap(one)(pairs.first, pairs.last, pairs.pieces)
+    return jax.vmap(one)(firsts, lasts, pieces)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.models.camera import Camera
+from jaxnav.calibrate.board.views import unproject
 from jaxnav.core.models.markers import CORNER_SIGNS
 from jaxnav.core.models.rig import CameraRig
 from jaxnav.core.pose.refine import solve_markers
@@ -62,9 +62,7 @@ def rays_camera(rig: CameraRig, views: RigViews) -> Float[np.ndarray, "N 4 3"]:
     rays = np.zeros((len(views), 4, 3))
     for index in range(len(rig)):
         seen = views.camera == index
-        camera = rig.camera(index)
-        unprojected = partial(_unprojected, camera)
-        rays[seen] = _in_batches(unprojected, views.corners_px[seen])
+        rays[seen] = _in_batches(partial(unproject, rig.camera(index)), views.corners_px[seen])
     return rays
 
 
@@ -78,17 +76,15 @@ def both_poses(
     """
     forward = rays.mean(axis=1)
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    R_camera_straight = _looking_along(forward)
+    aside = np.where(np.abs(forward[:, 1:2]) < 0.9, [[0.0, 1, 0]], [[1.0, 0, 0]])
+    x = np.cross(aside, forward)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    R_camera_straight = np.stack([x, np.cross(forward, x), forward], axis=2)
     straight = np.einsum("nji,nkj->nki", R_camera_straight, rays)
     corners_n = straight[..., :2] / np.maximum(straight[..., 2:], 1e-3)
     T = _in_batches(_solved, corners_n, size_m)
     T[:, :, :3] = np.einsum("nij,nbjk->nbik", R_camera_straight, T[:, :, :3])
     return T
-
-
-@jax.jit
-def _unprojected(camera: Camera, corners_px: Float[Array, "N 4 2"]) -> Float[Array, "N 4 3"]:
-    return camera.unproject(corners_px)
 
 
 @jax.jit
@@ -108,14 +104,6 @@ def _in_batches(function: Callable[..., Array], *rows: np.ndarray) -> np.ndarray
         shape = jax.eval_shape(function, *(jnp.asarray(array) for array in rows))
         return np.zeros(shape.shape)
     return np.concatenate(parts)[:count]
-
-
-def _looking_along(forward: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3 3"]:
-    """Rotations with the given directions as z axes."""
-    aside = np.where(np.abs(forward[:, 1:2]) < 0.9, [[0.0, 1, 0]], [[1.0, 0, 0]])
-    x = np.cross(aside, forward)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(forward, x), forward], axis=2)
 
 
 def wxyz_xyz(Ts: Float[np.ndarray, "n 4 4"]) -> Float[Array, "n 7"]:

@@ -2,18 +2,14 @@
 with a rig that is calibrated, or those markers that are not where the map says."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from jaxnav.calibrate.rig.calibrate import RigCalibration, calibrate_rig
 from jaxnav.calibrate.rig.marker_check import Check, Verdict, checked, sizes_m
-from jaxnav.calibrate.rig.vehicle_frame import (
-    driven_frame,
-    moved_to_driven,
-    moved_to_places,
-    moved_world,
-)
+from jaxnav.calibrate.rig.vehicle_frame import driven_frame, moved_to_driven, moved_to_places
 from jaxnav.calibrate.rig.views import Ts_vehicle_camera
 from jaxnav.commands.calibrate.arguments import CalibrateCheck, CalibrateMarkers, CalibrateRig
 from jaxnav.commands.calibrate.rig_data import RigData, RigResults, lines, read_rig_data
@@ -172,7 +168,14 @@ def _check(args: CalibrateCheck) -> int:
             "in view at once now and then, by any cameras",
         )
     out = output_folder(args.out)
-    results = RigResults("check", data, moved_world(calibration, check.T_map_world))
+    # Covariances stay, as twists are body-fixed.
+    move = check.T_map_world
+    in_map = replace(
+        calibration,
+        Ts_world_marker=move @ calibration.Ts_world_marker,
+        Ts_world_vehicle=move @ calibration.Ts_world_vehicle,
+    )
+    results = RigResults("check", data, in_map)
     report = results.report() | {
         "agreeing": check.agreeing,
         "verdicts": {" ".join(map(str, data.keys[i])): _as_json(v) for i, v in verdicts.items()},

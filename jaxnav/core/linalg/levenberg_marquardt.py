@@ -2,7 +2,7 @@
 
 optimistix provides the loop, the bound on the steps and the result codes. `NielsenLM` damps and
 accepts steps; a subclass solves the damped equations in their own shape: `NormalEquationsLM` here
-for a handful of unknowns, `SchurLM` in `schur.py` for blocks. Unlike
+for a handful of unknowns, `SchurLM` in `calibrate.schur` for blocks. Unlike
 `optimistix.LevenbergMarquardt` they form J'J once a step, and stop when no step can lower the cost
 any more, not when y and every residual stop changing.
 `benchmarks/bench_pair.py`: 1.6 times as fast at equal steps; compilation takes half

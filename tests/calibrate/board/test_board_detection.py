@@ -16,6 +16,8 @@ from jaxnav.calibrate.board.images import collect_views, source_files
 from jaxnav.calibrate.board.places import bent_places, straight_places
 from jaxnav.calibrate.board.saddles import Places, fit_saddles
 from jaxnav.calibrate.board.sheets import sheet_of
+from jaxnav.calibrate.board.views import BoardView
+from jaxnav.core.models.camera import Camera
 from jaxnav.detection.families import dictionary
 from jaxnav.errors import BadInput
 from jaxnav.sim.boards import BoardRenderer, facing_pose
@@ -38,15 +40,22 @@ POSES = [
 
 
 @cache
-def renderer(kind: str, blur_px: float = 0.7) -> BoardRenderer:
-    sheet = sheet_of(BOARDS[kind])
-    sensor = Sensor(psf_sigma_px=blur_px, read_noise_grey=2.0)
-    return BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor)
+def renderer(board: Board, **how: Shutter) -> BoardRenderer:
+    sheet = sheet_of(board)
+    sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0)
+    return BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor, **how)
 
 
 @cache
-def picture(kind: str, pose: int, blur_px: float = 0.7) -> np.ndarray:
-    return renderer(kind, blur_px).render(POSES[pose], np.random.default_rng(pose))
+def picture(board: str | Board, pose: int) -> np.ndarray:
+    printed = BOARDS[board] if isinstance(board, str) else board
+    return renderer(printed).render(POSES[pose], np.random.default_rng(pose))
+
+
+def found(board: Board, image: np.ndarray, camera: Camera | None = None) -> BoardView:
+    view = look_at(board, image, "here", camera).view
+    assert view is not None
+    return view
 
 
 def truth_px(
@@ -63,8 +72,7 @@ def truth_px(
 def test_points_are_found_to_hundredths_of_a_pixel(kind: str, pose: int) -> None:
     board = BOARDS[kind]
     expected_px = truth_px(board, POSES[pose])
-    view = look_at(board, picture(kind, pose), "here").view
-    assert view is not None
+    view = found(board, picture(kind, pose))
     assert view.name == "here"
     inside = np.all((expected_px > 3) & (expected_px < np.array(SIZE_PX) - 4), axis=1)
     assert len(view.ids) >= 0.97 * inside.sum()
@@ -74,23 +82,28 @@ def test_points_are_found_to_hundredths_of_a_pixel(kind: str, pose: int) -> None
     assert np.abs(error_px.mean(axis=0)).max() < 0.004
     # 10 % to 90 % of an edge: a Gaussian on top of a square pixel.
     assert view.edge_width_px == pytest.approx(2.563 * np.sqrt(0.7**2 + 1 / 12), rel=0.12)
+    if kind != "aprilgrid":  # OpenCV's refinement, from the truth on, is further off
+        end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
+        start = expected_px[view.ids, None].astype(np.float32)
+        theirs_px = cv2.cornerSubPix(picture(kind, pose), start, (3, 3), (-1, -1), end)[:, 0]
+        assert np.median(np.abs(error_px)) < np.median(np.abs(theirs_px - expected_px[view.ids]))
 
 
 @pytest.mark.parametrize(
     ("size", "inverted", "pose"),
-    [((8, 8), False, 0), ((9, 7), True, 1), ((7, 7), False, 2), ((7, 7), True, 0)],
+    [
+        pytest.param((8, 8), False, 0, marks=pytest.mark.long),
+        pytest.param((9, 7), True, 1, marks=pytest.mark.long),
+        pytest.param((7, 7), False, 2, marks=pytest.mark.long),
+        ((7, 7), True, 0),
+    ],
 )
 def test_a_chessboard_that_looks_the_same_when_turned_is_found(
     size: tuple[int, int], inverted: bool, pose: int
 ) -> None:
     board = Board("chessboard", *size, 0.02)
-    sheet = sheet_of(replace(board, white_top_left=inverted))
-    sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0)
-    image = BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor).render(
-        POSES[pose], np.random.default_rng(pose)
-    )
-    view = look_at(board, image, "here").view
-    assert view is not None
+    image = picture(replace(board, white_top_left=inverted), pose)
+    view = found(board, image)
     assert len(view.ids) >= 0.95 * len(board.points_board_m)
     expected_px = truth_px(board, POSES[pose])
     half = expected_px[::-1]  # the points of the board turned by half a turn
@@ -104,8 +117,7 @@ def test_a_chessboard_that_looks_the_same_when_turned_is_found(
 
 def test_a_chessboard_that_one_finder_loses_is_found_by_another(monkeypatch) -> None:
     board, image = BOARDS["chessboard"], picture("chessboard", 0)
-    expected, newer = look_at(board, image, "here").view, cv2.findChessboardCornersSB
-    assert expected is not None
+    expected, newer = found(board, image), cv2.findChessboardCornersSB
     widths: list[int] = []
     found_at = 800
 
@@ -115,24 +127,26 @@ def test_a_chessboard_that_one_finder_loses_is_found_by_another(monkeypatch) -> 
 
     monkeypatch.setattr(cv2, "findChessboardCornersSB", at_one_size_only)
     for found_at, last in ((800, 800), (0, 400)):  # noqa: B007
-        view = look_at(board, image, "here").view
-        assert view is not None
+        view = found(board, image)
         assert widths[-1] == last
         np.testing.assert_allclose(view.corners_px, expected.corners_px, atol=2e-3)
 
 
-@pytest.mark.parametrize("columns", [8, 9])
-@pytest.mark.parametrize("printed", [False, True])
+@pytest.mark.parametrize(
+    ("printed", "columns"),
+    [
+        (False, 8),
+        (True, 9),
+        pytest.param(False, 9, marks=pytest.mark.long),
+        pytest.param(True, 8, marks=pytest.mark.long),
+    ],
+)
 def test_the_pattern_of_a_charuco_board_is_found_out(
     printed: bool, columns: int, tmp_path: Path
 ) -> None:
     """Whatever its file says."""
     board = replace(BOARDS["charuco"], columns=columns, white_top_left=not printed)
-    sheet = sheet_of(replace(board, white_top_left=printed))
-    sensor = Sensor(psf_sigma_px=0.7, read_noise_grey=2.0)
-    image = BoardRenderer(CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor).render(
-        POSES[0], np.random.default_rng(0)
-    )
+    image = picture(replace(board, white_top_left=printed), 0)
     look = look_at(board, image, "here")
     assert look.view is not None
     assert look.board is not None
@@ -156,51 +170,20 @@ def test_a_spurious_id_does_not_refuse_a_set(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"{number}.png"), image)
     collected = collect_views(board, [tmp_path])
     assert len(collected.views.views) == 3
-    assert 49 in collected.foreign_ids
 
 
 def test_a_marker_s_corners_are_found_through_its_lens() -> None:
     board = BOARDS["marker"]
     for pose in (0, 1):
-        view = look_at(board, picture("marker", pose), "here", CAMERA).view
-        assert view is not None
+        view = found(board, picture("marker", pose), CAMERA)
         error_px = view.corners_px - truth_px(board, POSES[pose])
         assert np.sqrt(np.mean(error_px**2)) < 0.02
         assert view.edge_width_px == pytest.approx(2.563 * np.sqrt(0.7**2 + 1 / 12), rel=0.12)
 
 
-@pytest.mark.parametrize("kind", ["charuco", "chessboard"])
-def test_we_are_nearer_to_the_truth_than_opencv(kind: str) -> None:
-    board, errors, theirs = BOARDS[kind], [], []
-    for pose in range(len(POSES)):
-        image, expected_px = picture(kind, pose), truth_px(board, POSES[pose])
-        view = look_at(board, image, "here").view
-        assert view is not None
-        end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-        start = expected_px[view.ids, None].astype(np.float32)
-        sub_pix = cv2.cornerSubPix(image, start, (3, 3), (-1, -1), end)[:, 0]
-        errors.append(view.corners_px - expected_px[view.ids])
-        theirs.append(sub_pix - expected_px[view.ids])
-    assert np.median(np.abs(np.concatenate(errors))) < np.median(np.abs(np.concatenate(theirs)))
-
-
-def test_blur_widens_the_edges() -> None:
-    board = BOARDS["charuco"]
-    sharp, blurred = (
-        look_at(board, picture("charuco", 0, blur_px), "here").view for blur_px in (0.7, 1.4)
-    )
-    assert sharp is not None
-    assert blurred is not None
-    assert blurred.edge_width_px > 1.5 * sharp.edge_width_px
-
-
 def test_motion_widens_the_edges_across_it() -> None:
     board = BOARDS["charuco"]
-    sheet = sheet_of(board)
-    sensor = Sensor(psf_sigma_px=0.7)
-    moving = BoardRenderer(
-        CAMERA, SIZE_PX, sheet.ink, sheet.module_m, sensor, Shutter(exposure_s=0.02)
-    )
+    moving = renderer(board, shutter=Shutter(exposure_s=0.02))
 
     def T_board_camera_at(times_s: np.ndarray) -> np.ndarray:
         poses = np.zeros((len(times_s), 7))
@@ -209,13 +192,12 @@ def test_motion_widens_the_edges_across_it() -> None:
         return poses
 
     image = moving.render_moving(T_board_camera_at, np.random.default_rng(0))
-    view = look_at(board, image, "here").view
-    assert view is not None
+    view = found(board, image)
     T_camera_board = facing_pose((0, 0, 0.2), (0, 0))
     error_px = view.corners_px - truth_px(board, T_camera_board)[view.ids]
     assert np.sqrt(np.mean(error_px**2)) < 0.04
     still = look_at(
-        board, renderer("charuco").render(T_camera_board, np.random.default_rng(0)), ""
+        board, renderer(board).render(T_camera_board, np.random.default_rng(0)), ""
     ).view
     assert still is not None
     assert view.edge_width_px > 1.2 * still.edge_width_px
@@ -223,14 +205,12 @@ def test_motion_widens_the_edges_across_it() -> None:
 
 def test_a_point_that_is_moved_in_the_image_is_dropped() -> None:
     board, image = BOARDS["chessboard"], picture("chessboard", 0).copy()
-    before = look_at(board, image, "here").view
-    assert before is not None
+    before = found(board, image)
     victim = 24
     u, v = np.rint(before.corners_px[victim]).astype(int)
     # What was 3 px to the left comes here: a saddle as good as any other, in a wrong place.
     image[v - 9 : v + 10, u - 9 : u + 10] = image[v - 9 : v + 10, u - 12 : u + 7].copy()
-    after = look_at(board, image, "here").view
-    assert after is not None
+    after = found(board, image)
     assert before.ids[victim] not in after.ids
     assert len(after.ids) >= len(before.ids) - 3
 
@@ -249,11 +229,11 @@ def test_saddles_on_a_drawn_chequer() -> None:
     places = Places(
         centre[None] + [[0.6, -0.8]], along_px, np.zeros((1, 2)), np.ones(1), np.ones(1)
     )
-    found = fit_saddles(np.rint(image).astype(np.uint8), places, 7.0, 3.0)
-    assert found.good.all()
-    np.testing.assert_allclose(found.points_px[0], centre, atol=0.01)
-    np.testing.assert_allclose(found.sigma_px[0], np.sqrt(0.8**2 + 1 / 12), rtol=0.05)
-    assert found.amplitude[0] == pytest.approx(80, rel=0.02)  # black at its top left
+    saddles = fit_saddles(np.rint(image).astype(np.uint8), places, 7.0, 3.0)
+    assert saddles.good.all()
+    np.testing.assert_allclose(saddles.points_px[0], centre, atol=0.01)
+    np.testing.assert_allclose(saddles.sigma_px[0], np.sqrt(0.8**2 + 1 / 12), rtol=0.05)
+    assert saddles.amplitude[0] == pytest.approx(80, rel=0.02)  # black at its top left
     assert not fit_saddles(np.full((61, 61), 90, np.uint8), places, 7.0, 3.0).good.any()
 
 
@@ -275,12 +255,7 @@ def test_a_folder_is_read_in_order_each_image_once(folder: Path) -> None:
     assert collected.without_board == ("40.png",)
     assert collected.views.image_size_px == SIZE_PX
     np.testing.assert_array_equal(collected.views.points_board_m, BOARDS["charuco"].points_board_m)
-
-
-def test_a_file_that_is_named_twice_counts_once(folder: Path) -> None:
-    collected = collect_views(BOARDS["charuco"], [folder / "2.png", folder / "2.png"])
-    assert len(collected.views.views) == 1
-    assert len(collected.duplicates) == 1
+    assert len(collect_views(BOARDS["charuco"], [folder / "2.png"] * 2).views.views) == 1
 
 
 def test_of_a_video_the_frames_that_move_are_taken(tmp_path: Path) -> None:
@@ -300,7 +275,12 @@ def test_of_a_video_the_frames_that_move_are_taken(tmp_path: Path) -> None:
     [
         ("charuco", replace(BOARDS["charuco"], columns=8), "24, 25, 26 of 4x4_50 are seen"),
         ("charuco", replace(BOARDS["charuco"], columns=12, rows=8), "not arranged as on the"),
-        ("charuco", BOARDS["aprilgrid"], "shows markers of 4x4_1000 with a frame of 1 cell"),
+        pytest.param(
+            "charuco",
+            BOARDS["aprilgrid"],
+            "shows markers of 4x4_1000 with a frame of 1 cell",
+            marks=pytest.mark.long,
+        ),
         ("aprilgrid", BOARDS["charuco"], "shows markers of tag36h11 with a frame of 2 cells"),
         ("chessboard", Board("chessboard", 8, 7, 0.02), "shows a chessboard of"),
         ("chessboard", BOARDS["charuco"], "is found in 1 image: is it the right board"),
@@ -322,23 +302,21 @@ def test_images_of_two_sizes_are_refused_by_name(folder: Path) -> None:
 def test_what_is_no_image_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="has no images in it"):
         source_files([tmp_path])
-    (tmp_path / "a.txt").write_text("a")
-    with pytest.raises(BadInput, match="is neither a folder, an image nor a video"):
-        source_files([tmp_path / "a.txt"])
-    (tmp_path / "a.png").write_bytes(b"a")
-    with pytest.raises(BadInput, match=r"a\.png: is not an image"):
-        collect_views(BOARDS["charuco"], [tmp_path / "a.png"])
+    for name in ("a.txt", "a.png", "c.avi"):
+        (tmp_path / name).write_bytes(b"a")
+    for name, line in (
+        ("a.txt", "is neither a folder, an image nor a video"),
+        ("a.png", r"a\.png: is not an image"),
+        ("b.png", r"b\.png: can't be read"),
+        ("b.mp4", r"b\.mp4: can't be read"),
+        ("c.avi", r"c\.avi: is not a video"),
+    ):
+        with pytest.raises(BadInput, match=line):
+            collect_views(BOARDS["charuco"], [tmp_path / name])
     cv2.imwrite(str(tmp_path / "d.png"), picture("charuco", 0))
     collected = collect_views(BOARDS["charuco"], [tmp_path])
     assert len(collected.views.views) == 1
     assert collected.unreadable == (("a.png", "is not an image that OpenCV can read"),)
-    with pytest.raises(BadInput, match=r"b\.png: can't be read"):
-        collect_views(BOARDS["charuco"], [tmp_path / "b.png"])
-    with pytest.raises(BadInput, match=r"b\.mp4: can't be read"):
-        collect_views(BOARDS["charuco"], [tmp_path / "b.mp4"])
-    (tmp_path / "c.avi").write_bytes(b"a")
-    with pytest.raises(BadInput, match=r"c\.avi: is not a video"):
-        collect_views(BOARDS["charuco"], [tmp_path / "c.avi"])
 
 
 def test_edges_bend_at_the_border_of_a_board_as_inside() -> None:

@@ -197,7 +197,14 @@ PRINTS = {
 }
 
 
-@pytest.mark.parametrize("kind", PRINTS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "charuco",
+        *(pytest.param(kind, marks=pytest.mark.long) for kind in ("aprilgrid", "chessboard")),
+        "marker",
+    ],
+)
 def test_prints_are_true_to_scale(kind: str, tmp_path: Path) -> None:
     # A paper of whole pixels at 200 an inch, so that no rasteriser stretches it.
     paper_mm, dpi = (203.2, 279.4), 200

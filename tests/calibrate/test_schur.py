@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnav.core.linalg.schur import Blocks, reduce
+from jaxnav.calibrate.schur import Blocks, reduce
 
 
 def test_eliminating_blocks_solves_the_whole_system():
