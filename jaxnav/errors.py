@@ -57,7 +57,7 @@ class Containment:
     What is raised inside is counted by its source, and said, once a minute for each source.
 
         contained = Containment()
-        listen("/odom", contained.of("/odom", take))
+        listen("/odom", contained.wrap("/odom", take))
 
     Attributes:
         counts: how often each source has raised.
@@ -70,7 +70,7 @@ class Containment:
         self.counts: Counter[str] = Counter()
         self._say, self._said_s = say, dict[str, float]()
 
-    def of(
+    def wrap(
         self,
         source: str,
         function: Callable[..., Any],

@@ -116,13 +116,13 @@ def test_what_raises_is_named_counted_said_once_a_minute_and_ends_nothing(monkey
         return a / b
 
     for _ in range(3):
-        assert contained.of("/odom", divide, lambda problem, a, b: (problem, a))(1, 0) == (
+        assert contained.wrap("/odom", divide, lambda problem, a, b: (problem, a))(1, 0) == (
             "/odom: ZeroDivisionError: division by zero",
             1,
         )
-    assert contained.of("/odom", divide)(1, 2) == 0.5
+    assert contained.wrap("/odom", divide)(1, 2) == 0.5
     now_s[0] += 61.0
-    assert contained.of("/odom", divide)(1, 0) is None
+    assert contained.wrap("/odom", divide)(1, 0) is None
     problem = "/odom: ZeroDivisionError: division by zero"
     assert said == [problem, f"{problem} (4 times so far)"]
     assert contained.summary() == "raised, and were left out: /odom 4"
@@ -134,11 +134,11 @@ def test_nor_does_what_is_done_about_it(capsys):
     def fails(*arguments):
         raise ValueError("x" * 100_000 + "\x1b[31m")
 
-    assert Containment().of("a", fails, fails)() is None
+    assert Containment().wrap("a", fails, fails)() is None
     line = capsys.readouterr().err
     assert line.count("\n") == 1
     assert len(line) < 1100
     assert "\x1b" not in line
     contained = Containment(fails)
-    assert contained.of("a", fails, fails)() is None
+    assert contained.wrap("a", fails, fails)() is None
     assert contained.counts == {"a": 2}

@@ -95,11 +95,11 @@ class CarChassis:
     lever_m: float = 0.0
 
     @staticmethod
-    def of(vehicle: Vehicle) -> CarChassis:
+    def from_vehicle(vehicle: Vehicle) -> CarChassis:
         """That of a car's description."""
         speed_per_throttle_mps = float(vehicle.speed_per_throttle_mps)
         return CarChassis(
-            Limits.of(vehicle),
+            Limits.from_vehicle(vehicle),
             (float(vehicle.throttle_limit) * speed_per_throttle_mps,),
             float(vehicle.speed_time_constant_s),
             speed_per_throttle_mps,
@@ -173,13 +173,13 @@ class BaseChassis:
     lever_m: float
 
     @staticmethod
-    def of(base: TwistBase) -> BaseChassis:
+    def from_base(base: TwistBase) -> BaseChassis:
         """That of a base's description.
 
         The wheels of a differential drive turn it about their middle as fast as they drive it
         ahead: half its track width is the ratio of the two limits.
         """
-        limits = TwistLimits.of(base)
+        limits = TwistLimits.from_base(base)
         lever_m = min(limits.forward_mps / limits.turn_radps, _WIDEST_M)
         return BaseChassis(limits, float(base.time_constant_s), lever_m)
 
@@ -251,7 +251,11 @@ Chassis = CarChassis | BaseChassis
 
 def chassis_of(vehicle: Vehicle | TwistBase) -> Chassis:
     """That of a vehicle's description."""
-    return BaseChassis.of(vehicle) if turns_by_twist(vehicle) else CarChassis.of(vehicle)
+    return (
+        BaseChassis.from_base(vehicle)
+        if turns_by_twist(vehicle)
+        else CarChassis.from_vehicle(vehicle)
+    )
 
 
 def _can_be(names: tuple[str, ...], values: tuple[float, ...]) -> bool:

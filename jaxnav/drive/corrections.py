@@ -33,7 +33,7 @@ class Corrections:
     steering_limit_rad: float = math.inf  # of the servo, to either side
 
     @staticmethod
-    def of(vehicle: Vehicle | TwistBase) -> Corrections:
+    def from_vehicle(vehicle: Vehicle | TwistBase) -> Corrections:
         """The corrections in a vehicle's description."""
         if turns_by_twist(vehicle):
             return Corrections()
@@ -79,16 +79,16 @@ class Corrections:
         late_ns = self.frame_late_ns
         return replace(seen, stamp_ns=seen.stamp_ns - late_ns) if late_ns else seen
 
-    def told(self, command: Command) -> Command:
-        """The command that the vehicle's driver is told for a true one; see `servo_rad`."""
+    def command_for(self, command: Command) -> Command:
+        """The command that the vehicle's driver gets for a true one; see `servo_rad`."""
         return command if self._is_neutral else (self.servo_rad(command[0]), command[1])
 
     def servo_rad(self, steering_rad: float) -> float:
         """The servo angle that turns the wheels to an angle, within the servo's limit."""
         if self._is_neutral:
             return steering_rad
-        told_rad = self.read(0.0, steering_rad)[1]
-        return min(max(told_rad, -self.steering_limit_rad), self.steering_limit_rad)
+        servo_rad = self.read(0.0, steering_rad)[1]
+        return min(max(servo_rad, -self.steering_limit_rad), self.steering_limit_rad)
 
     def true_rad(self, servo_rad: float) -> float:
         """The angle of the wheels at a servo angle: the inverse of `servo_rad`."""

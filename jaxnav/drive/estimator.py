@@ -38,14 +38,14 @@ def advance_packed(
     """
     given = (part.unpack() for part in (belief, control, events))
     returned = advance(navigator, *given, *numbers)
-    belief, then, control, output = (PackedLayout.of(part).pack(part) for part in returned)
+    belief, then, control, output = (PackedLayout.from_tree(part).pack(part) for part in returned)
     return belief, then, control, output
 
 
 def _beginning(navigator: Navigator) -> tuple[Packed, Packed]:
     """The belief and control state at the start of a drive."""
     state = navigator.init()
-    belief, control = (PackedLayout.of(it).pack(it) for it in (state.belief, state.control))
+    belief, control = (PackedLayout.from_tree(it).pack(it) for it in (state.belief, state.control))
     return belief, control
 
 
@@ -243,7 +243,7 @@ def _layout(navigator: Navigator, seeing: bool) -> PackedLayout:
             gyro_since_radps=jnp.zeros((), dtype) if turns else None,
         )
 
-    return PackedLayout.of(jax.eval_shape(events))
+    return PackedLayout.from_tree(jax.eval_shape(events))
 
 
 def _us_between(earlier_ns: int, later_ns: int) -> int:

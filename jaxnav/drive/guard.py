@@ -149,7 +149,7 @@ class Guard:
             allowed = command if self._armed else self._limits.standing(command)
             allowed = self._limits.within(allowed, self._command, elapsed_s)
             try:
-                self._vehicle.write(*self._corrections.told(allowed))
+                self._vehicle.write(*self._corrections.command_for(allowed))
             except OSError:
                 return False
             finally:

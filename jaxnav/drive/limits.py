@@ -27,7 +27,7 @@ class Limits:
     throttle: float
 
     @staticmethod
-    def of(vehicle: Vehicle) -> Limits:
+    def from_vehicle(vehicle: Vehicle) -> Limits:
         """The limits in a car's description."""
         return Limits(
             float(vehicle.steering_limit_rad),
@@ -76,7 +76,7 @@ class TwistLimits:
     turn_radps: float
 
     @staticmethod
-    def of(base: TwistBase) -> TwistLimits:
+    def from_base(base: TwistBase) -> TwistLimits:
         """The limits in a base's description."""
         return TwistLimits(
             float(base.forward_limit_mps), float(base.left_limit_mps), float(base.turn_limit_radps)
@@ -113,7 +113,9 @@ def turns_by_twist(vehicle: Vehicle | TwistBase) -> TypeIs[TwistBase]:
 
 def limits_of(vehicle: Vehicle | TwistBase) -> CommandLimits:
     """The limits in a vehicle's description."""
-    return TwistLimits.of(vehicle) if turns_by_twist(vehicle) else Limits.of(vehicle)
+    return (
+        TwistLimits.from_base(vehicle) if turns_by_twist(vehicle) else Limits.from_vehicle(vehicle)
+    )
 
 
 def _clamped(value: float, limit: float, instead: float) -> float:

@@ -65,7 +65,7 @@ class Fenced:
 
     def __init__(self, observer: Observer, contained: Containment):
         def fence(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-            return contained.of(f"{type(observer).__name__}.{name}", function, self._failed)
+            return contained.wrap(f"{type(observer).__name__}.{name}", function, self._failed)
 
         self.on_outcome = fence("on_outcome", observer.on_outcome)
         self.on_frame = fence("on_frame", observer.on_frame)

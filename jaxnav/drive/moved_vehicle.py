@@ -119,7 +119,7 @@ class GuardProcess:
                 "options": dict(setup.options),
             },
             "limits": limits,
-            "corrections": Corrections.of(setup.vehicle),
+            "corrections": Corrections.from_vehicle(setup.vehicle),
             "timeout_s": timeout_s,
             "resumes": resumes,
         }

@@ -51,8 +51,8 @@ class Odometers:
         of_parts = driven_mps, believed or nothing, wanted_mps or nothing
         believable, faults = True, Fault(0)
         for part, speed_mps, of_part, wanted in zip(self.parts, *of_parts, strict=True):
-            told = speed_mps, values, stamp_ns, of_part, seeing, wanted, contradicted
-            taken, fault = part.judge(*told)
+            given = speed_mps, values, stamp_ns, of_part, seeing, wanted, contradicted
+            taken, fault = part.judge(*given)
             believable, faults = believable and taken, faults | fault
         return believable, faults
 

@@ -1,6 +1,6 @@
 """Pack trees of arrays into two vectors, since each array passed to a compiled call costs some us.
 
-packed = PackedLayout.of(tree).pack(tree)
+packed = PackedLayout.from_tree(tree).pack(tree)
 tree = packed.unpack()
 """
 
@@ -41,7 +41,7 @@ class PackedLayout:
     key: str = field(repr=False)
 
     @staticmethod
-    def of(tree: PyTree) -> "PackedLayout":
+    def from_tree(tree: PyTree) -> "PackedLayout":
         """The layout of a tree of floats of one precision, integers in int32's range, and bools."""
         leaves, structure = jax.tree.flatten(tree)
         places, ends, precision = [], [0, 0], "float32"

@@ -124,7 +124,7 @@ class _Known(NamedTuple):
     command: Command
 
     @staticmethod
-    def of(output: Output) -> "_Known":
+    def from_output(output: Output) -> "_Known":
         of_output = vars(output)  # reading an attribute of an equinox module takes 1 us
         command = vars(of_output["command"])
         return _Known(
@@ -180,7 +180,7 @@ class Pilot:
         self._origin_m = navigator.markers.origin_m
         self._chassis = chassis_of(navigator.controller.vehicle)
         self.limits = self._chassis.limits
-        self._corrections = Corrections.of(navigator.controller.vehicle)
+        self._corrections = Corrections.from_vehicle(navigator.controller.vehicle)
         gyro = gyro_of(navigator)
         self._turns = None if gyro is None else TurnVotes(self._chassis, gyro)
         mean_radps = None if self._turns is None else self._turns.mean_radps
@@ -293,7 +293,7 @@ class Pilot:
     ) -> Outcome:
         elapsed_ns = 0 if self._commanded_ns is None else now_ns - self._commanded_ns
         fused = self._estimator.fuse(data, stamp_ns, now_ns, elapsed_ns)
-        known = _Known.of(fused.output)
+        known = _Known.from_output(fused.output)
         finite = known.is_finite
         if not finite:
             faults |= Fault.NOT_FINITE

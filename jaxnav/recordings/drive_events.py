@@ -121,7 +121,7 @@ def _read_events(
     """Events of the inputs that `Pilot.handle` would believe, without an estimate."""
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     stamps, chassis = Stamps(), chassis_of(setup.vehicle)
-    corrections = Corrections.of(setup.vehicle)
+    corrections = Corrections.from_vehicle(setup.vehicle)
     for given in inputs:
         seen = [corrections.correct_frame(frame) for frame in given.frames]
         data, data_ns, _ = frames.check(seen, given.now_ns)

@@ -52,7 +52,7 @@ class Slots:
         branches = 2 * self.sightings - 1
         return enough & ((seen == 0) | (alive > 0)) & (alive + branches <= self.hypotheses)
 
-    def of(self, navigator: Navigator) -> Navigator:
+    def limit(self, navigator: Navigator) -> Navigator:
         """The navigator with so many slots for sightings."""
         if self.sightings is None:
             return navigator

@@ -165,7 +165,7 @@ class Rollout(eqx.Module):
         self, world: DriveState, keep: Keep, slots: Slots
     ) -> tuple[DriveState, tuple[Trace, PyTree], Bool[Array, ""]]:
         """Advance a drive by `chunk_frames`: the record of each, and whether slots were lacking."""
-        step = slots.of(self.navigator).step
+        step = slots.limit(self.navigator).step
 
         def frame(
             carry: tuple[DriveState, Array], _: None

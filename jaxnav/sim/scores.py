@@ -40,7 +40,7 @@ class Drives:
     scored_after_s: tuple[float, ...]
 
     @staticmethod
-    def of(drives: Trace, scenario: Scenario) -> "Drives":
+    def from_trace(drives: Trace, scenario: Scenario) -> "Drives":
         """The scores of traces with leading axes (S, frames)."""
         trace: Any = jax.device_get(drives)
         counted = trace.active & trace.located

@@ -30,7 +30,7 @@ class Reliability:
     counts: Int[np.ndarray, " bins"]
 
     @staticmethod
-    def of(
+    def from_predictions(
         probability: Float[np.ndarray, " N"], happened: Bool[np.ndarray, " N"], bins: int = 20
     ) -> "Reliability":
         """Bin predictions in [0, 1], without empty bins."""

@@ -46,7 +46,7 @@ def open_vehicle(setup: Setup) -> Vehicle:
     read_mode = whole_number(setup.options, "read_mode", 0, 0, 1)
     frequency = whole_number(setup.options, "frequency", 500, 100, 1000)
     car = _maker("--car qcar").QCar(readMode=read_mode, frequency=frequency)
-    vehicle = QCarVehicle(car, Limits.of(setup.vehicle))
+    vehicle = QCarVehicle(car, Limits.from_vehicle(setup.vehicle))
     if not vehicle.gives_data(_FIRST_DATA_S):
         vehicle.close()
         raise BadInput(

@@ -38,7 +38,7 @@ class SimVehicle:
         """Take the world, which the cameras look at too."""
         self.world, self.timeout_s = world, world.settings.vehicle_timeout_s
         self.waiting_clock = WaitingClock()
-        self._corrections = Corrections.of(world.vehicle)
+        self._corrections = Corrections.from_vehicle(world.vehicle)
         self._closed = False
 
     def read(self) -> Any:
@@ -86,7 +86,7 @@ class _Shutter:
     ):
         self._world, self._clock, self._renderer = world, clock, renderer
         self._period_ns = int(1e9 / rate_hz)
-        self._late_ns = Corrections.of(world.vehicle).frame_late_ns
+        self._late_ns = Corrections.from_vehicle(world.vehicle).frame_late_ns
         self.cameras = [NewestFrame(name, self._close) for name in names]
         self._closed = False
         self._due_ns: int | None = None  # when the frames that are made now will have come

@@ -68,7 +68,7 @@ def test_stamps_differ_by_the_delay_and_none_is_moved_ahead(corrections, frame_n
 
 @given(st.floats(), st.floats(), st.integers(0, 2**62))
 def test_without_a_calibration_nothing_is_touched(speed_mps, steering_rad, stamp_ns):
-    neutral = Corrections.of(worlds.qcar())
+    neutral = Corrections.from_vehicle(worlds.qcar())
     read = Odometry(stamp_ns, speed_mps, steering_rad)
     seen = FrameDetections(0, stamp_ns, None)
     assert neutral.correct_reading(read) is read
@@ -79,14 +79,14 @@ def test_without_a_calibration_nothing_is_touched(speed_mps, steering_rad, stamp
 
 
 def test_the_servo_turns_no_further_than_its_limit():
-    corrections = Corrections.of(vehicle(steering_gain=0.5))
+    corrections = Corrections.from_vehicle(vehicle(steering_gain=0.5))
     assert [corrections.servo_rad(rad) for rad in (0.5, -0.5, 0.02)] == [0.5, -0.5, 0.0]
 
 
 def test_the_guard_tells_the_servo_what_makes_the_angle_true():
     car = Car()
     clock = iter(range(0, 10**12, 10**8))  # 0.1 s between two looks at it
-    limits, told = Limits(0.5, 1e3, 0.3), Corrections.of(vehicle())
+    limits, told = Limits(0.5, 1e3, 0.3), Corrections.from_vehicle(vehicle())
     guard = Guard(car, limits, 1e3, now_ns=lambda: next(clock), corrections=told)
     guard.arm()
     guard.write(0.3, 0.1)
@@ -100,7 +100,7 @@ def test_a_pilot_whose_sensors_are_off_believes_the_same():
     steps = simulated(setup, 1.0)
     programs = _jitted(advance_packed)._cache_size()
     calibrated = dataclasses.replace(setup, vehicle=vehicle())
-    corrections = Corrections.of(calibrated.vehicle)
+    corrections = Corrections.from_vehicle(calibrated.vehicle)
     pilot = calibrated.pilot(None)
     for step in steps:
         outcome = pilot.handle(_as_sensed(step.input, corrections))

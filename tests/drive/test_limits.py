@@ -39,7 +39,7 @@ def test_without_a_time_that_went_by_the_steering_stays(elapsed_s):
 
 def test_the_limits_are_the_vehicles():
     vehicle = worlds.qcar()
-    limits = Limits.of(vehicle)
+    limits = Limits.from_vehicle(vehicle)
     assert (limits.steering_rad, limits.throttle) == (0.5, float(vehicle.throttle_limit))
     assert limits.steering_rate_radps == float(vehicle.steering_rate_limit_radps)
 

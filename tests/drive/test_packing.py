@@ -27,7 +27,7 @@ def trees(draw):
 @settings(max_examples=10)
 @given(trees())
 def test_a_tree_is_found_again_bit_for_bit(tree):
-    layout = PackedLayout.of(tree)
+    layout = PackedLayout.from_tree(tree)
     packed = layout.pack(tree)
     assert packed.floats.dtype == np.float32
     assert packed.integers.dtype == np.int32
@@ -51,10 +51,10 @@ def test_a_compiled_call_takes_and_returns_them(dtype):
         traces.append(packed)
         T, count = packed.unpack()
         tree = jaxlie.SE3(T.wxyz_xyz.at[4].add(1)), count + 1
-        return PackedLayout.of(tree).pack(tree)
+        return PackedLayout.from_tree(tree).pack(tree)
 
     tree = jaxlie.SE3(jnp.array([1, 0, 0, 0, 0, 2, 3], dtype)), jnp.zeros((2, 1), jnp.int32)
-    packed = PackedLayout.of(jax.eval_shape(lambda: tree)).pack(tree)
+    packed = PackedLayout.from_tree(jax.eval_shape(lambda: tree)).pack(tree)
     for _ in range(3):
         packed = moved(packed)
     T, count = packed.fetch().unpack()
@@ -73,6 +73,6 @@ def test_layouts_differ_where_shapes_types_or_structures_do():
         (zeros, zeros.astype(np.float64)),
         (zeros, zeros > 0),
     ]
-    layouts = [PackedLayout.of(tree) for tree in trees]
+    layouts = [PackedLayout.from_tree(tree) for tree in trees]
     assert len(set(layouts)) == len(layouts)
-    assert PackedLayout.of((zeros + 1, zeros)) == layouts[0]
+    assert PackedLayout.from_tree((zeros + 1, zeros)) == layouts[0]

@@ -69,7 +69,7 @@ def closing_notes(observers: Iterable[DriveObserver], contained: Containment) ->
     """
     for observer in observers:
         name = f"{type(observer).__name__}.closing_note"
-        note = contained.of(name, lambda one: one.closing_note)(observer)
+        note = contained.wrap(name, lambda one: one.closing_note)(observer)
         if note is not None:
             yield note
     if (raised := contained.summary()) is not None:
@@ -221,7 +221,7 @@ class DelayWatch(DriveObserver):
         self._delays = CameraDelays(setup.rig, setup.markers, car)
         self._faults = Fault(0)
         # What it raises must not end the thread, which nobody would notice.
-        self._solve = Containment().of("the delay watch", self._delays.solve)
+        self._solve = Containment().wrap("the delay watch", self._delays.solve)
         self._wake, self._closing = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="jaxnav-delays", daemon=True)
         self._thread.start()
@@ -266,7 +266,7 @@ class DelayWatch(DriveObserver):
 def delay_warnings(delays: CameraDelays, setup: DriveSetup) -> Iterator[str]:
     """A line for each camera whose stamps are surely wrong, or one line for all cameras."""
     camera_delays, together = delays.delays, delays.common_delay
-    file_s = Corrections.of(setup.vehicle).camera_delay_s
+    file_s = Corrections.from_vehicle(setup.vehicle).camera_delay_s
     known = [one for one in camera_delays if one.known]
     agree = all(
         abs(one.delay_s - together.delay_s) < 3 * math.hypot(one.sigma_s, together.sigma_s)
@@ -298,7 +298,7 @@ def describe_delay(delay: Delay) -> str:
 def delays_of(log: DriveLog, setup: DriveSetup) -> CameraDelays:
     """The delays of the cameras in the recorded drive of a car."""
     delays = CameraDelays(setup.rig, setup.markers, setup.car(Path("the drive")))
-    corrections, chassis = Corrections.of(setup.vehicle), chassis_of(setup.vehicle)
+    corrections, chassis = Corrections.from_vehicle(setup.vehicle), chassis_of(setup.vehicle)
     frames = FrameIntake(len(setup.rig), setup.markers, setup.corner_sigma_px)
     outcomes = log.outcomes
     poses = planar_in_world(outcomes.pose, opposite(setup.markers.origin_m))

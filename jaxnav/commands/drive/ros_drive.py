@@ -290,7 +290,7 @@ def _close(
 ) -> None:
     """Close observers, and say what they sum up; those that are closed already are gone."""
     for observer in observers:
-        contained.of(f"{type(observer).__name__}.close", observer.close)()
+        contained.wrap(f"{type(observer).__name__}.close", observer.close)()
     for note in closing_notes(observers, contained):
         say(note)
     observers.clear()

@@ -231,7 +231,7 @@ class PreparedBody(Prepared):
                         tracker.add(index, sighted.stamp_ns, sighted.detections)
 
             name, rest = f"camera {camera.name}", lambda problem: over.wait(LOOK_S)
-            fenced = connection.contained.of(name, turn, rest)
+            fenced = connection.contained.wrap(name, turn, rest)
             while not over.is_set():
                 fenced()
 

@@ -134,7 +134,7 @@ def open_observers(args: Run, setup: DriveSetup, closing: ExitStack) -> list[Dri
     observers: list[DriveObserver] = []
 
     def add(observer: DriveObserver) -> None:
-        closing.callback(Containment().of(f"{type(observer).__name__}.close", observer.close))
+        closing.callback(Containment().wrap(f"{type(observer).__name__}.close", observer.close))
         observers.append(observer)
 
     if args.record is not None:
@@ -283,7 +283,7 @@ class Drive:
         self.kept_by = f"a thread, {args.car} can't be moved to another process: {why}"
         _say(args, f"guard: {self.kept_by}")
         vehicle = plugins.open_vehicle(args.car, self._setup)
-        corrections = Corrections.of(self._setup.vehicle)
+        corrections = Corrections.from_vehicle(self._setup.vehicle)
         clock = vehicle.waiting_clock if isinstance(vehicle, HasTime) else None
         now_ns = time.monotonic_ns if clock is None else clock.now_ns
         guard = Guard(vehicle, limits, args.timeout_s, now_ns, corrections, self._resumes)

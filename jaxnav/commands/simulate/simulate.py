@@ -170,7 +170,7 @@ def _drive(
     ) as bar:  # fmt: skip
         keys = jax.vmap(jax.random.key)(args.seed + jnp.arange(args.seeds))
         trace = rollout.run(keys, update_after_compiling(bar))
-    return Drives.of(trace, scenario).summary()
+    return Drives.from_trace(trace, scenario).summary()
 
 
 def _key(args: Arguments, car: ScenarioCar, name: str, noise_px: float) -> dict[str, Any]:

@@ -25,7 +25,7 @@ def run(args: Arguments) -> int:
     if not len(probability):
         raise BadInput(args.recording or "--frames", "gave no frame with two poses to choose from")
     out = output_folder(args.out)
-    reliability = Reliability.of(probability, flipped)
+    reliability = Reliability.from_predictions(probability, flipped)
     summary: dict[str, Any] = {
         "frames": name,
         "pairs": len(probability),

@@ -184,7 +184,7 @@ def _test(
     nominal = dataclasses.replace(loop, rollout=dataclasses.replace(loop.rollout, spread=None))
     losses, costs, trace = nominal.value(values, _keys(_TEST_SEED, count), progress)
     once = np.ones(len(losses))
-    success = Drives.of(trace, loop.rollout.scenario).success
+    success = Drives.from_trace(trace, loop.rollout.scenario).success
     rate = float(np.mean(success))
     low, high = wilson_interval(np.array(rate), np.array(len(success)))
     own = np.asarray(trace.active)[0]

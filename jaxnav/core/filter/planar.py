@@ -138,8 +138,8 @@ class BicycleKalman(Motion):
                     later, P = slip_of(turn, read, turn_sigma_radps, later, P)
                 later, P = self._with_odometry(later, P, obs, dt_s, turn.measured)
                 read = read_velocity(self.vehicle, obs, later)
-                told = turn, mean[3:5], read, turn_sigma_radps, dt_s
-                later, P = bias_at_rest(gyro, *told, later, P)
+                read_turn = turn, mean[3:5], read, turn_sigma_radps, dt_s
+                later, P = bias_at_rest(gyro, *read_turn, later, P)
                 later = later.at[2].set(wrap_angle(later[2]))
             change = _in_body(later) - _in_body(mean)
             return later, P, velocity_lead_after(velocity_lead, change, dt_s)

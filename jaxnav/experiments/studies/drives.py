@@ -247,7 +247,7 @@ def _replaced(whole: Any, **fields: object) -> Any:
 
 def _scores(trace: Trace, scenario: Scenario) -> dict[str, np.ndarray]:
     """The scores of drives: one number per drive for each variable."""
-    drives = Drives.of(trace, scenario)
+    drives = Drives.from_trace(trace, scenario)
     on_floor = np.asarray(trace.on_floor).all(axis=1)
     outcome = np.where(drives.success, ARRIVED, np.where(on_floor, FAILED, LEFT_FLOOR))
     finite = np.isfinite(np.asarray(trace.pose)).all(axis=2) & np.isfinite(drives.nees)

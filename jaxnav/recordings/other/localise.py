@@ -156,9 +156,9 @@ def filter_frames(
     """Filter F frames in all tracks: the (tracks,) beliefs after them, their poses, and, if asked
     for, what a smoother needs of them."""
 
-    Told = tuple[Belief, tuple[Localised, _Kept | None]]
+    Tracked = tuple[Belief, tuple[Localised, _Kept | None]]
 
-    def track(belief: Belief, obs: Observation, marker: Array) -> Told:
+    def track(belief: Belief, obs: Observation, marker: Array) -> Tracked:
         of_track = navigator
         if alone:
             of_track = _alone(navigator, marker)
@@ -170,10 +170,10 @@ def filter_frames(
             filtered = _Kept(dataclasses.replace(belief, repeats=None), estimate.candidates)
         return belief, (Localised.from_estimate(estimate), filtered)
 
-    def frame(beliefs: Belief, obs: Observation) -> Told:
+    def frame(beliefs: Belief, obs: Observation) -> Tracked:
         tracks = jnp.arange(len(navigator.markers.ids) if alone else 1)
-        told: Told = jax.vmap(track, (0, None, 0))(beliefs, obs, tracks)
-        return told
+        tracked: Tracked = jax.vmap(track, (0, None, 0))(beliefs, obs, tracks)
+        return tracked
 
     beliefs, (poses, filtered) = jax.lax.scan(frame, beliefs, obs)
     return beliefs, poses, filtered

@@ -123,8 +123,8 @@ def replay(
             lambda *leaves: np.concatenate(leaves)[:total], *chunks
         )
         pose = np.asarray(poses_in_world(pose, recording.markers.origin_m))
-        told = pose, seen, located, decided, flip_probability, nees, branch
-        return Replay(*told, frames_per_second, corner_sigma_px, filtered)
+        measured = pose, seen, located, decided, flip_probability, nees, branch
+        return Replay(*measured, frames_per_second, corner_sigma_px, filtered)
 
     filtered = joined(chunks[:count])
     return joined(chunks[count:][::-1], filtered) if smooth else filtered

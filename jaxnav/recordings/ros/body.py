@@ -58,7 +58,7 @@ class BodyTracker:
         self._came = threading.Condition()
         self._closed = False
         self.late = self._behind = 0
-        self._handle = (contained or Containment()).of("the tracker", self._track)
+        self._handle = (contained or Containment()).wrap("the tracker", self._track)
         self._thread = threading.Thread(target=self._run, name="tracker", daemon=True)
 
     def warm_up(self) -> None:

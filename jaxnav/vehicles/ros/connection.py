@@ -129,12 +129,12 @@ class Connection:
         quality = qos_profile_sensor_data  # best effort, which reliable publishers suit too
         if latched:
             quality = QoSProfile(depth=_LATCHED, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        contained = self.contained.of(topic, take, lambda problem, message: failed())
+        contained = self.contained.wrap(topic, take, lambda problem, message: failed())
         return self.node.create_subscription(message_type(kind), topic, contained, quality)
 
     def every(self, period_s: float, name: str, function: Callable[[], None]) -> None:
         """Call a function again and again, in the thread of `run`."""
-        contained = self.contained.of(name, function)
+        contained = self.contained.wrap(name, function)
         self.node.create_timer(period_s, lambda: contained())  # or it would be passed the time
 
     def serve(

@@ -83,10 +83,10 @@ class Publisher:
         self._diagnosed_s = 0.0
         self._delays = Statistics()
         contained = connection.contained  # ROS refuses what it can't send
-        self._send_tf = contained.of("publishing tf", self._publish_tf)
-        self._send_pose = contained.of("publishing the pose", self._publish_pose)
-        self._send_others = contained.of("publishing the bank", self._publish_others)
-        self._send_map = contained.of("publishing the map", self._publish_map)
+        self._send_tf = contained.wrap("publishing tf", self._publish_tf)
+        self._send_pose = contained.wrap("publishing the pose", self._publish_pose)
+        self._send_others = contained.wrap("publishing the bank", self._publish_others)
+        self._send_map = contained.wrap("publishing the map", self._publish_map)
         self.show_map(markers)
         self._thread = threading.Thread(target=self._run, name="ros publisher", daemon=True)
         self._thread.start()

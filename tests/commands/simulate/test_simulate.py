@@ -43,7 +43,7 @@ def trace(drives=4, frames=60, **changes) -> Trace:
 
 
 def test_perfect_drives():
-    summary = Drives.of(trace(), SCENARIO).summary()
+    summary = Drives.from_trace(trace(), SCENARIO).summary()
     assert summary["drives"] == 4
     assert summary["success_rate"]["value"] == 1
     assert 0.4 < summary["success_rate"]["interval"][0] < 0.6  # Wilson, 4 of 4
@@ -61,7 +61,7 @@ def test_wrong_headings_and_failures_are_counted_where_they_are():
     on_floor[0, 50:] = False  # it has left the floor
     passed[1] = 1  # it falls short of a waypoint
     drives = trace(pose=pose, on_floor=on_floor, passed=passed)
-    summary = Drives.of(drives, SCENARIO).summary()
+    summary = Drives.from_trace(drives, SCENARIO).summary()
     assert summary["wrong_branch_fraction"]["value"] == pytest.approx(45 / 240)
     assert summary["wrong_branch_fraction_after_2s"]["value"] == pytest.approx(15 / 120)
     assert summary["wrong_once_decided_fraction"]["value"] == pytest.approx(40 / 220)
@@ -73,7 +73,7 @@ def test_wrong_headings_and_failures_are_counted_where_they_are():
 def test_drives_that_never_decide_count_as_never():
     decided = np.zeros((5, 60), bool)
     decided[:2, 5:] = True
-    drives = Drives.of(trace(5, decided=decided), SCENARIO)
+    drives = Drives.from_trace(trace(5, decided=decided), SCENARIO)
     assert drives.time_to_decide_s.tolist() == [5 / 15, 5 / 15, np.inf, np.inf, np.inf]
     assert drives.summary()["time_to_decide_s"]["median"]["value"] == np.inf
 
@@ -82,7 +82,7 @@ def test_calibration_error_is_the_weighted_gap():
     probability = np.repeat([0.02, 0.52], [30, 10])
     happened = np.zeros(40, bool)
     happened[30:37] = True
-    found = Reliability.of(probability, happened)
+    found = Reliability.from_predictions(probability, happened)
     assert found.counts.tolist() == [30, 10]
     assert found.expected_calibration_error == pytest.approx((30 * 0.02 + 10 * 0.18) / 40)
 
@@ -93,12 +93,12 @@ def test_errors_after_twenty_seconds_count_apart():
     pose[..., 0] = np.where(times_s < 20 - 1e-9, 0.05, 0.01)
     nees = np.broadcast_to(np.where(times_s < 20 - 1e-9, 3.0, 9.0), (4, 330))
     drives = trace(frames=330, pose=pose, nees=nees)
-    summary = Drives.of(drives, on_laps(SCENARIO, 4)).summary()
+    summary = Drives.from_trace(drives, on_laps(SCENARIO, 4)).summary()
     assert summary["median_position_error_m"]["value"] == pytest.approx(0.05)
     assert summary["median_position_error_m_after_20s"]["value"] == pytest.approx(0.01)
     assert summary["anees_after_20s"]["value"] == pytest.approx(9)
     assert np.isnan(summary["anees_after_60s"]["value"])  # no drive lasts so long
-    assert not any("after_20s" in name for name in Drives.of(drives, SCENARIO).summary())
+    assert not any("after_20s" in name for name in Drives.from_trace(drives, SCENARIO).summary())
 
 
 def test_a_short_simulation_writes_its_numbers_and_resumes(tmp_path, stranger, capsys):

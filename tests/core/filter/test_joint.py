@@ -69,7 +69,7 @@ def test_a_wall_of_markers_flips_and_says_how_probably(frames):
     probability, flipped, pair = frames(0.0)
     assert np.mean(pair) > 0.1
     assert np.mean(flipped[pair]) > 0.1
-    found = Reliability.of(probability[pair], flipped[pair], bins=10)
+    found = Reliability.from_predictions(probability[pair], flipped[pair], bins=10)
     assert found.expected_calibration_error < 0.07
     assert np.mean(probability[pair]) == pytest.approx(np.mean(flipped[pair]), rel=0.15)
 

@@ -193,7 +193,7 @@ def test_drives_are_those_of_simulate(tmp_path: Path) -> None:
         keys = jax.vmap(lambda trial: jax.random.fold_in(key, trial))(np.arange(6))
         rollout = study.rollout(cells[1], scenario)
         assert isinstance(rollout, Rollout)
-        drives = Drives.of(rollout.run(keys), scenario)
+        drives = Drives.from_trace(rollout.run(keys), scenario)
     np.testing.assert_allclose(found["duration_s"][1], drives.duration_s, rtol=1e-6)
     decided = [e[d] for e, d in zip(drives.position_error_m, drives.decided, strict=True)]
     medians = [np.median(e) if len(e) else np.nan for e in decided]

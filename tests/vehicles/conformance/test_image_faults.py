@@ -191,7 +191,7 @@ class Drive:
         output = eqx.tree_at(
             lambda o: (o.pose_covariance, o.velocity_covariance), made, (1e-4 * np.eye(3),) * 2
         )
-        packed = PackedLayout.of(output).pack(output)
+        packed = PackedLayout.from_tree(output).pack(output)
         self.pilot = Pilot(
             navigator, program=lambda belief, control, *_: (belief, belief, control, packed)
         )
