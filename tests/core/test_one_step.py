@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.drive.estimator import Estimator
 from jaxnav.drive.history import EventData
 from tests import worlds
+from tests.helpers.simulated import make_setup
 from tests.reference import paper
 
 # Relative beyond 1; both are 0 as a rule.
@@ -68,17 +68,6 @@ def seen() -> Observation:
             np.full((STEPS, 4, 1, 4), SIGMA_PX),
         ),
         is_leaf=lambda leaf: leaf is None,
-    )
-
-
-def navigator(**options) -> Navigator:
-    options = {"selector": MultiHypothesis(hypotheses=12), "max_sightings": 2} | options
-    return Navigator(
-        worlds.qcar_rig(),
-        worlds.paper_markers(),
-        worlds.qcar(),
-        worlds.WAYPOINTS_M,
-        **options,
     )
 
 
@@ -142,7 +131,7 @@ def test_the_cars_program_is_step(seen, precision, tolerance):
     seen = jax.tree.map(
         lambda leaf: leaf.astype(precision) if np.issubdtype(leaf.dtype, float) else leaf, seen
     )
-    nav = navigator()
+    nav = make_setup().navigator()
     known = by_the_car(nav, seen)
     assert known[0].output.pose.dtype == precision
     gap, where = farthest(known, by_step(nav, seen))

@@ -100,3 +100,6 @@ def find(snapshot: Snapshot) -> Candidates:
 def select(selector, prior, candidates, snapshot) -> Selection:
     """What a selector makes of them."""
     return selector(prior, candidates, snapshot)
+
+
+snap = jax.jit(Snapshot.create, static_argnames="max_sightings")

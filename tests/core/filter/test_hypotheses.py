@@ -25,10 +25,10 @@ from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
-from tests.helpers.compiling import jit_to_run
-from tests.helpers.filters import believing, find, select
+from tests.helpers.filters import believing, find, select, snap
 from tests.reference import kalman, paper
-from tests.reference.rigid import cayley, inverse_cayley
+from tests.reference.rigid import cayley, inverse_cayley, twist_matrix, wxyz_xyz
+from tests.reference.rigid import matrix as matrix_of
 
 WHEELBASE_M = 0.256
 EYE = np.eye(6)
@@ -52,11 +52,11 @@ def view(pose, sigma_px: float = 0.3, seed: int = 0) -> Snapshot:
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
     noise = sigma_px * np.random.default_rng(seed).standard_normal((4, 1, 4, 2))
     obs = worlds.observe(rig, markers, worlds.planar(*pose), jnp.asarray(noise))
-    return Snapshot.create(rig, markers, obs, sigma_px)
+    return snap(rig, markers, obs, sigma_px)
 
 
 def matrix(T: jaxlie.SE3) -> np.ndarray:
-    return np.asarray(T.as_matrix())
+    return matrix_of(T.wxyz_xyz)
 
 
 def derivative(function, x, h=1e-5) -> np.ndarray:
@@ -72,14 +72,15 @@ def priors(pose, freedom=PLANAR, nuisance=None, count=8, scale=1.0, seed=1) -> P
     roots = [np.diag(sigma * rng.uniform(0.7, 1.5, d)) @ (np.eye(d) + 0.3 * rng.normal(size=(d, d)))
              for _ in range(count)]  # fmt: skip
     off = [0.7 * freedom @ (sigma * rng.normal(size=d)) for _ in range(count)]
-    Ts = [worlds.planar(*pose) @ jaxlie.SE3.exp(jnp.asarray(xi)) for xi in off]
+    here = matrix(worlds.planar(*pose))
+    Ts = np.stack([here @ scipy.linalg.expm(twist_matrix(xi)) for xi in off])
     return PoseBelief(
-        T_world_vehicle=jaxlie.SE3(jnp.stack([T.wxyz_xyz for T in Ts])),
-        covariance=jnp.stack([jnp.asarray(freedom @ L @ L.T @ freedom.T) for L in roots]),
-        log_weight=jnp.full(count, -np.log(count)),
-        initialised=jnp.ones(count, bool),
+        T_world_vehicle=jaxlie.SE3(jnp.asarray(wxyz_xyz(Ts))),
+        covariance=jnp.asarray([freedom @ L @ L.T @ freedom.T for L in roots]),
+        log_weight=jnp.asarray(np.full(count, -np.log(count))),
+        initialised=jnp.asarray(np.ones(count, bool)),
         freedom=jnp.asarray(freedom),
-        nuisance=jnp.zeros((6, 0)) if nuisance is None else jnp.asarray(nuisance),
+        nuisance=jnp.asarray(np.zeros((6, 0)) if nuisance is None else nuisance),
         gate_nis=jnp.inf,
     )
 
@@ -160,13 +161,16 @@ def correlations(covariance, freedom) -> np.ndarray:
     return P / (sigma[:, :, None] * sigma[:, None])
 
 
-@jit_to_run
+@jax.jit
 def covariances_of(here, prior, snapshot, floors):
     fits = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
     return fits.posterior.covariance
 
 
-@pytest.mark.parametrize("freedom", [PLANAR, EYE], ids=["car", "free"])
+@pytest.mark.parametrize(
+    "freedom",
+    [pytest.param(PLANAR, id="car"), pytest.param(EYE, id="free", marks=pytest.mark.long)],
+)
 def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom):
     """A drive's first frames: nothing known to a metre, corners known to a fiftieth of a pixel."""
     snapshot, prior = view(NEAR, 0.02), priors(NEAR, freedom, scale=20.0)
@@ -298,6 +302,10 @@ def viewing_directions(Ts_world_vehicle: np.ndarray, snapshot: Snapshot) -> np.n
     return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
+grounded = jax.jit(on_ground)
+fan_of = jax.jit(fan, static_argnames="hypotheses")
+
+
 @pytest.mark.parametrize("pose", [worlds.START_VIEW, (0.0, -0.4, np.pi / 2), NEAR])
 @pytest.mark.parametrize("kind", ["car", "free"])
 def test_the_fan_covers_all_viewing_angles(kind, pose):
@@ -307,7 +315,7 @@ def test_the_fan_covers_all_viewing_angles(kind, pose):
     bank = MultiHypothesis(hypotheses=24 if kind == "car" else 60)
     freedom = PLANAR if kind == "car" else EYE
     prior = priors(pose, freedom=freedom, count=bank.hypotheses)
-    start = fan(prior, candidates, snapshot, bank.hypotheses)
+    start = fan_of(prior, candidates, snapshot, bank.hypotheses)
     assert start.initialised.shape == (bank.hypotheses,)
     assert np.sum(np.exp(start.log_weight)) == pytest.approx(1)
     Ts = matrix(start.T_world_vehicle)
@@ -329,17 +337,18 @@ def test_the_fan_covers_all_viewing_angles(kind, pose):
         gaps_deg = np.rad2deg(np.arccos(np.clip(wanted @ directions.T, -1, 1))).min(axis=1)
         assert gaps_deg.max() < 20
         centers = np.linalg.inv(members)[:, :3] @ np.append(
-            np.asarray(snapshot.markers.Ts_world_marker.translation())[0], 1
+            np.asarray(snapshot.markers.Ts_world_marker.wxyz_xyz)[0, 4:], 1
         )
         np.testing.assert_allclose(centers, np.broadcast_to(centers[:1], centers.shape), atol=1e-9)
     # The truth and every candidate, as an upright marker's mirror image is one, are near a member
     # by its own covariance.
-    wanted = [worlds.planar(*pose)] + [
-        jaxlie.SE3(T).inverse() for T in candidates.T_vehicle_world.wxyz_xyz[candidates.valid]
-    ]
+    valid = np.asarray(candidates.valid)
+    Ts = np.linalg.inv(matrix(candidates.T_vehicle_world)[valid])
+    wanted = np.concatenate([matrix(worlds.planar(*pose))[None], Ts])
+    if kind == "car":
+        wanted = np.stack([matrix(grounded(jaxlie.SE3(jnp.asarray(wxyz_xyz(T))))) for T in wanted])
     for T in wanted:
-        T = on_ground(T) if kind == "car" else T
-        xi = np.stack([inverse_cayley(np.linalg.inv(member) @ matrix(T)) for member in members])
+        xi = np.stack([inverse_cayley(np.linalg.inv(member) @ T) for member in members])
         P = freedom.T @ np.asarray(start.covariance)[: len(members)] @ freedom
         distances = [
             x @ freedom @ np.linalg.solve(C, freedom.T @ x) for x, C in zip(xi, P, strict=True)
@@ -363,7 +372,11 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     belief = believing(motion, means, covariances, weights)
     belief = dataclasses.replace(belief, initialised=jnp.asarray(alive))
 
-    after = merge_hypotheses(belief, jnp.asarray(merged_into), motion.difference, motion.moved)
+    @jax.jit
+    def merged(bank, into):
+        return merge_hypotheses(bank, into, motion.difference, motion.moved)
+
+    after = merged(belief, jnp.asarray(merged_into))
     assert after.initialised.tolist() == [True, False, True, False, False, False]
     for receiver in (0, 2):
         who = np.flatnonzero((merged_into == receiver) & alive)
@@ -379,7 +392,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
         np.testing.assert_allclose(error, 0, atol=1e-12)
         np.testing.assert_allclose(after.covariance[receiver], covariance, atol=1e-12)
         assert np.exp(after.log_weight[receiver]) == pytest.approx(weights[who].sum())
-    alone = merge_hypotheses(belief, jnp.arange(count), motion.difference, motion.moved)
+    alone = merged(belief, jnp.arange(count))
     for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(belief), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-15)
 
@@ -391,18 +404,20 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
     motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
     rng = np.random.default_rng(5)
     shifts = 0.15 * rng.normal(size=(4, size))
-    start = motion.init(4)
-    seam = start.mean.at[:, 2].add(3.1 if kind == "car" else 0.0)
-    means = jax.vmap(motion.moved)(seam, jnp.asarray(shifts))
+    moved = jax.jit(jax.vmap(motion.moved))
+    seam = np.array(motion.init(4).mean)
+    seam[:, 2] += 3.1 if kind == "car" else 0.0
+    means = np.asarray(moved(jnp.asarray(seam), jnp.asarray(shifts)))
     roots = 0.02 * rng.normal(size=(4, size, size)) + 0.03 * np.eye(size)
     share = np.array([0.5, 0.3, 0.2, 0.9])
     belief = believing(motion, means, roots @ np.swapaxes(roots, 1, 2), share)
-    belief = dataclasses.replace(belief, initialised=jnp.arange(4) < 3)
+    belief = dataclasses.replace(belief, initialised=jnp.asarray([True, True, True, False]))
     drawn = rng.choice(3, size=20_000, p=share[:3])
     errors = np.einsum("sde,se->sd", roots[drawn], rng.normal(size=(len(drawn), size)))
-    truths = jax.vmap(motion.moved)(means[drawn], jnp.asarray(errors))
-    away = np.asarray(jax.vmap(lambda truth: motion.difference(truth, means[0]))(truths))
-    covariance = np.asarray(motion.error_covariance(belief, jnp.asarray(0)))
+    truths = moved(means[drawn], jnp.asarray(errors))
+    away = np.asarray(jax.jit(jax.vmap(motion.difference, (0, None)))(truths, means[0]))
+    error_covariance = eqx.filter_jit(motion.error_covariance)
+    covariance = np.asarray(error_covariance(belief, jnp.asarray(0)))
     nees = np.einsum("sd,sd->s", away, np.linalg.solve(covariance, away.T).T)
     assert nees.mean() == pytest.approx(size, rel=0.03)
     own = np.einsum("sd,sd->s", away, np.linalg.solve(belief.covariance[0], away.T).T)
@@ -410,7 +425,7 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
     # Nobody there, and nobody else.
     for nobody in (motion.init(4), motion.init(1)):
         np.testing.assert_array_equal(
-            motion.error_covariance(nobody, jnp.asarray(0)), nobody.covariance[0]
+            error_covariance(nobody, jnp.asarray(0)), nobody.covariance[0]
         )
 
 
@@ -442,7 +457,7 @@ def _car(precision: str) -> Navigator:
     return Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
 
 
-@jit_to_run
+@jax.jit
 @functools.partial(jax.vmap, in_axes=(None, 0))
 def run(nav: Navigator, obs: Observation) -> Seen:
     def step(state, obs):
@@ -581,9 +596,10 @@ def test_one_gross_outlier_changes_nothing():
     clean = run(car(), obs)
     assert np.all(clean.decided[:, frame - 1 :])
     assert np.max(errors_of(clean, poses)[0][:, frame - 1 :]) < 0.05
-    moved = obs.corners_px.at[:, frame].add(jnp.asarray([60.0, -25.0]).reshape(1, 1, 1, 1, 2))
-    mixed_up = obs.corners_px.at[:, frame].set(jnp.roll(obs.corners_px[:, frame], 1, axis=3))
-    for corners_px in (moved, mixed_up):
+    moved, mixed_up = np.array(obs.corners_px), np.array(obs.corners_px)
+    moved[:, frame] += [60.0, -25.0]
+    mixed_up[:, frame] = np.roll(mixed_up[:, frame], 1, axis=3)
+    for corners_px in map(jnp.asarray, (moved, mixed_up)):
         spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, corners_px))
         assert np.all(spoilt.nis[:, frame] > 100)
         assert np.all(spoilt.rejections[:, frame] == 1)
@@ -602,18 +618,14 @@ def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
     """One hypothesis alone, and nothing in view: what its heading's sigma says."""
     far_deg = 20.0
     snapshot = view(NEAR)
-    nothing = Snapshot.create(
-        snapshot.rig,
-        snapshot.markers,
-        eqx.tree_at(lambda o: o.visible, snapshot.obs, jnp.zeros_like(snapshot.obs.visible)),
-        0.3,
-    )
+    blind = dataclasses.replace(snapshot.obs, visible=jnp.asarray(np.zeros((4, 1), bool)))
+    nothing = snap(snapshot.rig, snapshot.markers, blind, 0.3)
     prior = priors(NEAR)
-    only = eqx.tree_at(lambda p: p.initialised, prior, jnp.arange(8) == 3)
+    only = eqx.tree_at(lambda p: p.initialised, prior, jnp.asarray(np.arange(8) == 3))
     decides = eqx.tree_at(lambda s: s.decided_mass, EXACT, MultiHypothesis().decided_mass)
     for sigma_deg in (2.0, 10.0, 40.0):
         P = np.diag([0.05, 0.05, 0, 0, 0, np.deg2rad(sigma_deg)]) ** 2
-        wide = eqx.tree_at(lambda p: p.covariance, only, jnp.tile(jnp.asarray(P), (8, 1, 1)))
+        wide = eqx.tree_at(lambda p: p.covariance, only, jnp.asarray(np.tile(P, (8, 1, 1))))
         selection = select(decides, wide, find(nothing), nothing)
         expected = 2 * scipy.stats.norm.sf(far_deg / sigma_deg)
         assert float(selection.flip_probability) == pytest.approx(expected, rel=1e-3, abs=1e-12)
@@ -736,21 +748,23 @@ def test_a_step_has_finite_gradients(precision):
 def test_what_is_no_other_candidate_is_no_flip():
     """Not the selected one itself, which a compiler may compute twice, nor one that merges with it;
     wherever it lies, the probability has a slope."""
-    yaw_deg = np.array([0.0, 0.0, 0.5, 40.0])
-    flip = jax.jit(nearer_to_another)
+    yaw_rad = jnp.asarray(np.deg2rad([0.0, 0.0, 0.5, 40.0]))
+    here = worlds.planar(0.0, 0.0, np.deg2rad(2.0)).wxyz_xyz
 
-    def probability(nudge_rad, selected: int, valid: list[bool]) -> jax.Array:
-        turns_rad = jnp.deg2rad(yaw_deg) + nudge_rad * jnp.array([0.0, 1.0, 0.0, 0.0])
-        Ts = jax.vmap(lambda psi: worlds.planar(0.0, 0.0, 0.0) @ yawed(psi))(turns_rad)
-        found = Candidates.none(4, float)
-        found = eqx.tree_at(
-            lambda c: (c.T_vehicle_world, c.valid), found, (Ts.inverse(), jnp.asarray(valid))
-        )
-        here = jaxlie.SE3(worlds.planar(0.0, 0.0, np.deg2rad(2.0)).wxyz_xyz[None])
-        return flip(here, 0.1**2 * jnp.eye(6)[None], found, jnp.asarray(selected))[0]
+    def of(nudge_rad, selected, valid) -> jax.Array:
+        turns_rad = yaw_rad + nudge_rad * jnp.array([0.0, 1.0, 0.0, 0.0])
+        Ts = jax.vmap(lambda psi: worlds.planar(0.0, 0.0, psi).inverse())(turns_rad)
+        found = dataclasses.replace(Candidates.none(4, float), T_vehicle_world=Ts, valid=valid)
+        return nearer_to_another(
+            jaxlie.SE3(here[None]), 0.1**2 * jnp.eye(6)[None], found, selected
+        )[0]
 
-    def yawed(psi_rad: jax.Array) -> jaxlie.SE3:
-        return jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(psi_rad))
+    value_and_slope = jax.jit(jax.value_and_grad(of))
+
+    def probability(nudge_rad, selected: int, valid: list[bool]) -> float:
+        value, slope = value_and_slope(nudge_rad, selected, jnp.asarray(valid))
+        assert np.isfinite(slope)
+        return float(value)
 
     expected = scipy.stats.norm.sf((20.0 - 2.0) / np.rad2deg(0.1))
     for nudge_rad in (0.0, 1e-12, 1e-9, 1e-7):
@@ -760,6 +774,4 @@ def test_what_is_no_other_candidate_is_no_flip():
             several = probability(nudge_rad, selected, [True] * 4)
             np.testing.assert_allclose(several, alone, rtol=0.2)
         assert probability(nudge_rad, 0, [True, True, True, False]) == 0
-        slope = jax.grad(probability)(nudge_rad, 0, [True] * 4)
-        assert np.isfinite(slope)
     assert probability(0.0, 3, [True] * 4) > 0.99
