@@ -73,7 +73,7 @@ def look(rig: CameraRig, markers: MarkerMap, pose, noise, sees) -> Observation:
 
 
 def at(tree, index):
-    return jax.tree.map(lambda leaf: leaf[index], tree)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), tree)
 
 
 def floats_of(tree):
@@ -306,7 +306,7 @@ def test_broken_readings_are_contained(bound, field):
         obs = at(drive(), 0)
         located, _ = jitted(nav.init(), obs)
         for value in BROKEN:
-            broken = np.full_like(getattr(obs, field), value)
+            broken = jnp.asarray(np.full_like(getattr(obs, field), value))
             state, out = jitted(located, dataclasses.replace(obs, **{field: broken}))
             check_contained(state, out)
             if field == "corners_px" and not np.isfinite(value):
@@ -318,9 +318,11 @@ def test_broken_readings_are_contained(bound, field):
 
 def test_nan_odometry_is_a_step_without_odometry(located):
     nav, state, obs = located
-    expected, _ = step(nav, state, dataclasses.replace(obs, has_odometry=np.asarray(False)))
+    expected, _ = step(nav, state, dataclasses.replace(obs, has_odometry=jnp.asarray(False)))
     for field in ("speed_mps", "steering_rad"):
-        actual, _ = step(nav, state, dataclasses.replace(obs, **{field: np.asarray(np.nan)}))
+        actual, _ = step(
+            nav, state, dataclasses.replace(obs, **{field: jnp.asarray(np.nan, float)})
+        )
         for one in ("mean", "covariance"):
             found, told = (getattr(after.belief.bank, one) for after in (actual, expected))
             np.testing.assert_array_equal(found, told)

@@ -19,7 +19,7 @@ def believing(motion, means, covariances, weights=None) -> Bank:
     means, P = jnp.asarray(means, float), jnp.asarray(covariances, float)
     means, P = means.reshape(-1, means.shape[-1]), P.reshape(-1, *P.shape[-2:])
     count = len(means)
-    share = jnp.full(count, 1 / count) if weights is None else jnp.asarray(weights, float)
+    share = jnp.full(count, 1 / count, float) if weights is None else jnp.asarray(weights, float)
     return dataclasses.replace(
         motion.init(count),
         mean=means,

@@ -590,28 +590,28 @@ def test_wheels_that_slip_choose_no_branch(seed):
 
 
 def test_one_gross_outlier_changes_nothing():
-    """One frame in which another thing was taken for the marker, or its corners were mixed up."""
+    """One frame in which another thing was taken for the marker, or, in every other drive, its
+    corners were mixed up."""
     poses, frame = arc((1.2, 0.2, np.deg2rad(170.0)), 0.3, 0.0), 40
     obs = sensed(poses, 0.3)
     clean = run(car(), obs)
     assert np.all(clean.decided[:, frame - 1 :])
     assert np.max(errors_of(clean, poses)[0][:, frame - 1 :]) < 0.05
-    moved, mixed_up = np.array(obs.corners_px), np.array(obs.corners_px)
-    moved[:, frame] += [60.0, -25.0]
-    mixed_up[:, frame] = np.roll(mixed_up[:, frame], 1, axis=3)
-    for corners_px in map(jnp.asarray, (moved, mixed_up)):
-        spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, corners_px))
-        assert np.all(spoilt.nis[:, frame] > 100)
-        assert np.all(spoilt.rejections[:, frame] == 1)
-        assert np.all(spoilt.rejections[:, frame + 1] == 0)
-        assert np.all(spoilt.decided[:, frame:])
-        assert np.all(spoilt.flip_probability[:, frame] < 1e-6)
-        # Later two poses of the marker come close, and it is in doubt which one is nearer anyway.
-        more = np.asarray(spoilt.flip_probability) - np.asarray(clean.flip_probability)
-        assert np.max(more[:, frame:]) < 1e-3
-        gaps_m, gaps_rad = errors_of(spoilt, np.asarray(clean.pose))
-        assert np.max(gaps_m) < 0.01
-        assert np.max(gaps_rad) < np.deg2rad(0.5)
+    corners_px = np.array(obs.corners_px)
+    corners_px[::2, frame] += [60.0, -25.0]
+    corners_px[1::2, frame] = np.roll(corners_px[1::2, frame], 1, axis=3)
+    spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, jnp.asarray(corners_px)))
+    assert np.all(spoilt.nis[:, frame] > 100)
+    assert np.all(spoilt.rejections[:, frame] == 1)
+    assert np.all(spoilt.rejections[:, frame + 1] == 0)
+    assert np.all(spoilt.decided[:, frame:])
+    assert np.all(spoilt.flip_probability[:, frame] < 1e-6)
+    # Later two poses of the marker come close, and it is in doubt which one is nearer anyway.
+    more = np.asarray(spoilt.flip_probability) - np.asarray(clean.flip_probability)
+    assert np.max(more[:, frame:]) < 1e-3
+    gaps_m, gaps_rad = errors_of(spoilt, np.asarray(clean.pose))
+    assert np.max(gaps_m) < 0.01
+    assert np.max(gaps_rad) < np.deg2rad(0.5)
 
 
 def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
