@@ -1,8 +1,6 @@
 """Algorithm 1 as one pure step: the same alone, scanned and vmapped; its gradient; bad input."""
 
 import dataclasses
-import functools
-from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -15,19 +13,15 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from jaxnav.core.filter.bank import PoseBelief
-from jaxnav.core.filter.choose import LowestReprojection, MeasuredPose, PaperCost, Selection
-from jaxnav.core.models.markers import MarkerMap
-from jaxnav.core.models.rig import CameraRig
+from jaxnav.core.filter.choose import LowestReprojection, PaperCost
 from jaxnav.core.navigator import Navigator, Output, State
 from jaxnav.core.parameters import parameters_of, with_parameters
-from jaxnav.core.pose.observation import Observation, Snapshot
-from jaxnav.core.pose.refine import Candidates
+from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32
-from tests.helpers.filters import planar_part
+from tests.helpers.filters import derivative, planar_part, sense, snap, whitened_pixels
 from tests.reference import kalman, paper
-from tests.reference.rigid import inverse_cayley, matrix, twist_matrix, wxyz_xyz
+from tests.reference.rigid import cayley, inverse_cayley, matrix, twist_matrix, wxyz_xyz
 
 WHEELBASE_M = 0.256
 DT_S = 0.1
@@ -57,18 +51,9 @@ def drive(sigma_px: float = 0.2, seed: int = 0, blind: tuple[int, ...] = ()) -> 
     """What the car senses on the way, leading axis (STEPS,)."""
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
     noise = sigma_px * np.random.default_rng(seed).standard_normal((STEPS, 4, 1, 4, 2))
-    sees = np.ones(STEPS, bool)
-    sees[list(blind)] = False
-
-    return jax.device_get(look(rig, markers, *map(jnp.asarray, (true_poses(), noise, sees))))
-
-
-@jax.jit
-@functools.partial(jax.vmap, in_axes=(None, None, 0, 0, 0))
-def look(rig: CameraRig, markers: MarkerMap, pose, noise, sees) -> Observation:
-    T_world_vehicle = worlds.T_world_vehicle_from_planar(pose)
-    odometry = {"speed_mps": SPEED_MPS, "steering_rad": STEERING_RAD, "dt_s": DT_S}
-    obs = worlds.observe(rig, markers, T_world_vehicle, noise, **odometry)
+    told = jnp.asarray(true_poses()), jnp.asarray(noise), SPEED_MPS, STEERING_RAD, DT_S
+    obs = jax.device_get(sense(rig, markers, *told))
+    sees = ~np.isin(np.arange(STEPS), blind)[:, None, None]
     return eqx.tree_at(lambda o: o.visible, obs, obs.visible & sees)
 
 
@@ -160,25 +145,10 @@ def test_the_car_is_located_in_both_precisions(bound):
 
 def reference_pose_covariance(nav: Navigator, pose, sigma_px: float) -> np.ndarray:
     """Covariance of (x, y, psi) at a pose from the pixels' derivatives: equations and loops."""
-    rig, corners = nav.rig, np.asarray(nav.markers.corners_world_m)[0]
-    visible = np.asarray(worlds.observe(rig, nav.markers, worlds.planar(*pose)).visible)[:, 0]
-    T_world_vehicle = matrix(worlds.planar(*pose).wxyz_xyz)
-    Ts_camera_vehicle = matrix(rig.Ts_camera_vehicle.wxyz_xyz)
-
-    def pixels(xi):
-        T_vehicle_world = np.linalg.inv(T_world_vehicle @ expm(twist_matrix(xi)))
-        seen = []
-        for j in np.flatnonzero(visible):
-            camera = rig.camera(int(j))
-            for corner in corners:
-                p = Ts_camera_vehicle[j] @ T_vehicle_world @ np.append(corner, 1)
-                K = np.asarray(camera.K)
-                seen.append(paper.project(K, "equidistant", np.asarray(camera.distortion), p[:3]))
-        return np.ravel(seen)
-
-    h = 1e-5
-    J = np.stack([(pixels(h * e) - pixels(-h * e)) / (2 * h) for e in np.eye(6)], axis=1)
-    return planar_part(np.linalg.inv(J.T @ J / sigma_px**2), pose[2])
+    obs = worlds.observe(nav.rig, nav.markers, worlds.planar(*pose))
+    snapshot, T = snap(nav.rig, nav.markers, obs, sigma_px), matrix(worlds.planar(*pose).wxyz_xyz)
+    J = derivative(lambda xi: whitened_pixels(snapshot, T @ cayley(xi)), np.zeros(6))
+    return planar_part(np.linalg.inv(J.T @ J), pose[2])
 
 
 def test_the_first_two_steps_by_hand():
@@ -403,55 +373,6 @@ def test_a_rollout_of_20_steps_has_a_finite_gradient(precision):
         assert leaf.dtype == precision
         assert np.all(np.isfinite(leaf)), name
         assert np.all(leaf != 0), name
-
-
-class EachItsOwn(eqx.Module):
-    """A toy bank: hypothesis k takes candidate k, and weighs what that leaves unexplained."""
-
-    hypotheses: ClassVar[int] = 2
-
-    def __call__(self, prior: PoseBelief, candidates: Candidates, snapshot: Snapshot) -> Selection:
-        del snapshot
-        valid, cost = candidates.valid[:2], candidates.cost[:2]
-        Ts_world_vehicle = jax.vmap(lambda T: T.inverse())(candidates.T_vehicle_world)
-        log_weight = prior.log_weight - jnp.where(valid, cost, 20.0) / 2
-        return Selection(
-            measured=MeasuredPose(
-                jaxlie.SE3(Ts_world_vehicle.wxyz_xyz[:2]),
-                candidates.covariance[:2],
-                jnp.where(valid, -cost / 2, 0),
-                valid,
-            ),
-            kept=prior.initialised,
-            log_weight=log_weight,
-            merged_into=jnp.arange(2),
-            costs=jnp.where(candidates.valid, candidates.cost, jnp.inf),
-            selected=jnp.where(jnp.any(valid), jnp.argmax(log_weight), -1),
-            flip_probability=jnp.asarray(0.5),
-            decided=jnp.asarray(True),
-        )
-
-
-@pytest.mark.long
-def test_more_hypotheses_need_no_change_to_step():
-    """K = 2 through the same step: the reported pose is that of the heavier one."""
-    nav = navigator(selector=EachItsOwn())
-    assert nav.init().belief.bank.mean.shape == (2, 6)
-    state, out = step_by_step(nav, drive(sigma_px=0.3))
-    assert state.belief.bank.mean.shape == (2, 6)
-    assert out.nis.shape == (STEPS,)
-    heavier = int(np.argmax(state.belief.bank.log_weight))
-    assert int(out.hypothesis[-1]) == heavier
-    np.testing.assert_allclose(out.pose[-1], state.belief.bank.mean[heavier, :3], atol=1e-12)
-    share = np.exp(np.asarray(state.belief.bank.log_weight))
-    means = np.asarray(state.belief.bank.mean)
-    apart = means - means[heavier]
-    apart[:, 2] = kalman.wrap(apart[:, 2])
-    spread = np.asarray(state.belief.bank.covariance) + np.einsum("id,ie->ide", apart, apart)
-    expected = np.einsum("i,ide->de", share / share.sum(), spread)
-    np.testing.assert_allclose(out.covariance[-1], expected, atol=1e-12)
-    assert not np.allclose(state.belief.bank.mean[0], state.belief.bank.mean[1], atol=0.01)
-    assert abs(float(state.belief.bank.log_weight[0] - state.belief.bank.log_weight[1])) > 1
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from jaxnav.core.pose.observation import Observation
 from jaxnav.drive.estimator import Estimator
 from jaxnav.drive.history import EventData
 from tests import worlds
+from tests.helpers.filters import sense
 from tests.helpers.simulated import make_setup
 from tests.reference import paper
 
@@ -44,12 +45,7 @@ def seen() -> Observation:
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
     noise_px = SIGMA_PX * np.random.default_rng(3).standard_normal((STEPS, 4, 1, 4, 2))
 
-    @jax.jit
-    @jax.vmap
-    def look(pose, noise_px):
-        return worlds.observe(rig, markers, worlds.T_world_vehicle_from_planar(pose), noise_px)
-
-    obs = look(jnp.asarray(poses()), jnp.asarray(noise_px))
+    obs = sense(rig, markers, jnp.asarray(poses()), jnp.asarray(noise_px))
     lit = ~np.isin(np.arange(STEPS), TUNNEL)
     dt_s = np.full(STEPS, PERIOD_US) * 1e-6
     dt_s[0] = 0

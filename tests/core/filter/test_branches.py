@@ -21,7 +21,8 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
-from tests.core.filter.test_hypotheses import EYE, PLANAR, derivative, matrix, view, whitened_pixels
+from tests.core.filter.test_hypotheses import EYE, PLANAR, matrix, view
+from tests.helpers.filters import derivative, whitened_pixels
 from tests.reference.rigid import cayley, inverse_cayley, wxyz_xyz
 from tests.reference.rigid import matrix as matrix_of
 

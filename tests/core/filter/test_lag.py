@@ -12,6 +12,7 @@ from jaxnav.core.filter.smooth import Trail
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
+from tests.helpers.filters import sense
 
 FRAMES, DT_S, LAG_S, SIGMA_PX = 24, 0.1, 0.8, 0.2
 
@@ -31,17 +32,13 @@ def navigator(**further) -> Navigator:
 def drive() -> tuple[Observation, np.ndarray]:
     """A rig that passes a marker, seen in all frames but three, and its true positions."""
     rng, rig, markers = np.random.default_rng(4), worlds.qcar_rig(), worlds.paper_markers()
-    seen, truth = [], []
-    for frame in range(FRAMES):
-        time_s = DT_S * frame
-        T = worlds.planar(-0.3 + 0.5 * time_s, -0.9 + 0.1 * time_s, 1.4 + 0.2 * time_s)
-        obs = worlds.observe(rig, markers, T)
-        corners_px = obs.corners_px + SIGMA_PX * rng.normal(size=obs.corners_px.shape)
-        visible = np.asarray(obs.visible) & (frame not in (10, 11, 12))
-        seen.append(Observation(corners_px, jnp.asarray(visible), dt_s=jnp.asarray(DT_S)))
-        truth.append(np.asarray(T.wxyz_xyz)[4:])
-    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *seen)
-    return stacked, np.stack(truth)
+    times_s = DT_S * np.arange(FRAMES)[:, None]
+    poses = np.array([-0.3, -0.9, 1.4]) + times_s * [0.5, 0.1, 0.2]
+    noise_px = SIGMA_PX * rng.normal(size=(FRAMES, 4, 1, 4, 2))
+    obs = sense(rig, markers, jnp.asarray(poses), jnp.asarray(noise_px), 0.0, 0.0, DT_S)
+    shown = np.asarray(obs.visible) & ~np.isin(np.arange(FRAMES), (10, 11, 12))[:, None, None]
+    obs = eqx.tree_at(lambda o: o.visible, obs, jnp.asarray(shown))
+    return obs, np.column_stack([poses[:, :2], np.zeros(FRAMES)])
 
 
 begin, back = jax.jit(Trail.begin), jax.jit(Trail.back)

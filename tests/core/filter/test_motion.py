@@ -509,14 +509,16 @@ def test_constant_velocity_carries_its_covariance_as_samples_do():
         believed = jaxlie.SE3(later.mean[0, :7])
         return jnp.append((believed.inverse() @ truth).log(), error[6:])
 
-    count = 20_000
-    errors = np.asarray(moved(jnp.asarray(rng.normal(size=(count, 12)) @ root.T)))
-    P = np.asarray(later.covariance[0])
-    whitened = np.linalg.solve(np.linalg.cholesky(P), errors.T)
-    # Sampling noise, and 5 % for the Jacobian of exp that F leaves out (half the turn, 0.05 rad).
-    np.testing.assert_allclose(
-        whitened @ whitened.T / count, np.eye(12), atol=0.05 + 5 / np.sqrt(count)
-    )
+    errors = moved(jnp.asarray(rng.normal(size=(20_000, 12)) @ root.T))
+    # 5 % for the Jacobian of exp that F leaves out (half the turn, 0.05 rad).
+    check_samples(errors, later, 0.05)
+
+
+def check_samples(errors, bank: Bank, share: float = 0.0) -> None:
+    """Whether samples (N, 12) have the covariance of a hypothesis, but for a share and noise."""
+    whitened = np.linalg.solve(np.linalg.cholesky(bank.covariance[0]), np.asarray(errors).T)
+    found, count = whitened @ whitened.T, whitened.shape[1]
+    np.testing.assert_allclose(found / count, np.eye(12), atol=share + 5 / np.sqrt(count))
 
 
 def test_odometry_s_motion_carries_its_covariance_as_samples_do():
@@ -550,9 +552,7 @@ def test_odometry_s_motion_carries_its_covariance_as_samples_do():
         jnp.asarray(rng.normal(size=(count, 6)) * np.sqrt(np.repeat([linear, angular], 3))),
         jnp.asarray(rng.normal(size=(count, 6)) * np.sqrt(A * dt_s / 3)),
     )
-    factor = np.linalg.cholesky(np.asarray(after.covariance[0]))
-    whitened = np.linalg.solve(factor, np.asarray(errors).T)
-    np.testing.assert_allclose(whitened @ whitened.T / count, np.eye(12), atol=5 / np.sqrt(count))
+    check_samples(errors, after)
 
 
 def test_odometry_s_drift_does_not_depend_on_how_often_it_is_read():
