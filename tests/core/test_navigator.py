@@ -19,7 +19,7 @@ from jaxnav.core.parameters import parameters_of, with_parameters
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import in_float32
-from tests.helpers.filters import derivative, planar_part, sense, snap, whitened_pixels
+from tests.helpers.filters import derivative, planar_part, sense, snap, step, whitened_pixels
 from tests.reference import kalman, paper
 from tests.reference.rigid import cayley, inverse_cayley, matrix, twist_matrix, wxyz_xyz
 
@@ -63,9 +63,6 @@ def at(tree, index):
 
 def floats_of(tree):
     return jax.tree.leaves(eqx.filter(tree, eqx.is_inexact_array))
-
-
-step = jax.jit(lambda navigator, state, obs: navigator.step(state, obs))
 
 
 def step_by_step(nav: Navigator, obs: Observation, step=step) -> tuple[State, Output]:

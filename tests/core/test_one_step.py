@@ -1,4 +1,4 @@
-"""The car's compiled program makes the same of events as a scan of `step`."""
+"""The car's compiled program makes the same of events as `step`."""
 
 import operator
 from functools import partial
@@ -14,7 +14,7 @@ from jaxnav.core.pose.observation import Observation
 from jaxnav.drive.estimator import Estimator
 from jaxnav.drive.history import EventData
 from tests import worlds
-from tests.helpers.filters import sense
+from tests.helpers.filters import sense, step
 from tests.helpers.simulated import make_setup
 from tests.reference import paper
 
@@ -81,13 +81,12 @@ def by_the_car(nav: Navigator, seen: Observation) -> list:
 
 
 def by_step(nav: Navigator, seen: Observation):
-    """(belief, output), leading axis (STEPS,)."""
-
-    def step(state, obs):
-        state, output = nav.step(state, obs)
-        return state, (state.belief, output)
-
-    return jax.device_get(jax.jit(lambda obs: jax.lax.scan(step, nav.init(), obs)[1])(seen))
+    """(belief, output) after each step."""
+    state, known = nav.init(), []
+    for index in range(STEPS):
+        state, output = step(nav, state, jax.tree.map(operator.itemgetter(index), seen))
+        known.append(jax.device_get((state.belief, output)))
+    return known
 
 
 def without_empty_slots(belief, output) -> list[tuple[str, np.ndarray]]:
@@ -108,12 +107,12 @@ def without_empty_slots(belief, output) -> list[tuple[str, np.ndarray]]:
     return [(jax.tree_util.keystr(path), np.asarray(leaf)) for path, leaf in leaves]
 
 
-def farthest(known: list, scanned) -> tuple[float, str]:
+def farthest(known: list, stepped: list) -> tuple[float, str]:
     """By how much the two differ at most: absolute, beyond 1 relative."""
     worst = (0.0, "")
-    for index, fused in enumerate(known):
+    for index, (fused, by_hand) in enumerate(zip(known, stepped, strict=True)):
         one = without_empty_slots(fused.belief, fused.output)
-        other = without_empty_slots(*jax.tree.map(operator.itemgetter(index), scanned))
+        other = without_empty_slots(*by_hand)
         for (name, a), (_, b) in zip(one, other, strict=True):
             differs = a != b  # infinities too
             gap = np.abs(a[differs].astype(float) - b[differs]) / np.maximum(np.abs(b[differs]), 1)

@@ -107,6 +107,7 @@ def select(selector, prior, candidates, snapshot) -> Selection:
 
 
 snap = jax.jit(Snapshot.create, static_argnames="max_sightings")
+step = jax.jit(lambda navigator, state, obs: navigator.step(state, obs))
 
 
 @jax.jit

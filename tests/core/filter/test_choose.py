@@ -68,7 +68,7 @@ def belief(T_world_vehicle: jaxlie.SE3, initialised: bool = True, count: int = 1
     return PoseBelief(
         T_world_vehicle=jaxlie.SE3(Ts),
         covariance=jnp.tile(1e-4 * eye, (count, 1, 1)),
-        log_weight=jnp.full(count, -np.log(count)),
+        log_weight=jnp.full(count, -np.log(count), float),
         initialised=jnp.full(count, initialised),
         freedom=eye[:, jnp.asarray([0, 1, 5])],
         nuisance=0.005 * eye[:, jnp.asarray([2, 3, 4])],
@@ -193,6 +193,9 @@ class TestEverySelector:
                     assert int(alone.selected) == -1
                     assert not np.any(alone.measured.valid)
                     assert bool(alone.decided) <= initialised
+                    np.testing.assert_array_equal(alone.kept, prior.initialised)
+                    if selector.hypotheses == 1 or not initialised:
+                        assert alone.flip_probability == 0
                 elif not isinstance(selector, RatioTest):
                     assert int(alone.selected) >= 0
                     assert np.any(alone.measured.valid)
@@ -216,18 +219,6 @@ class TestEverySelector:
             np.testing.assert_array_equal(selection.measured.covariance[0], np.eye(6))
             np.testing.assert_array_equal(selection.kept, prior.initialised)
             np.testing.assert_array_equal(selection.log_weight, prior.log_weight)
-
-    def test_selects_nothing_where_nothing_is_valid(self, selector, precision):
-        candidates = candidates_at([TRUTH, TRUTH], [0.0, 0.0], [False, False])
-        for initialised in (False, True):
-            prior = belief(worlds.planar(*TRUTH), initialised, selector.hypotheses)
-            selection = select(selector, prior, candidates, seen_from(worlds.NO_VIEW))
-            check_selection(selection, selector, candidates, precision)
-            assert int(selection.selected) == -1
-            assert not np.any(selection.measured.valid)
-            np.testing.assert_array_equal(selection.kept, prior.initialised)
-            if selector.hypotheses == 1 or not initialised:
-                assert selection.flip_probability == 0
 
 
 # The bank's are those of a step, in test_hypotheses.py.
@@ -350,19 +341,24 @@ def object_space_m2(candidates: Candidates, prior: jaxlie.SE3, snapshot: Snapsho
     ]
 
 
-def test_object_space_is_equation_14_alone():
+def test_object_space_is_equation_14_and_the_paper_s_cost_adds_equation_13():
     snapshot = seen_from((0.2, 0.1, 0.6), one_marker=False)
     prior = worlds.planar(0.25, 0.05, 0.7)
-    candidates = candidates_at([(0.5, -0.2, 0.1), (0.2, 0.1, 0.6)], [0.1, 1e4])
-    selection = select(ObjectSpace(), belief(prior), candidates, snapshot)
-    expected = object_space_m2(candidates, prior, snapshot)
-    np.testing.assert_allclose(selection.costs[:2], expected, rtol=1e-11)
-    assert expected[1] < expected[0]
-    assert int(selection.selected) == 1
-    # Without a prediction there is only the image.
-    first = select(ObjectSpace(), belief(prior, initialised=False), candidates, snapshot)
-    np.testing.assert_array_equal(first.costs[:2], [0.1, 1e4])
-    assert int(first.selected) == 0
+    for rule, e1_px2, weight in (
+        (ObjectSpace(), np.array([0.1, 1e4]), (0, 1)),
+        (PaperCost(), np.array([3.0, 4.0]), (1, 100**2)),
+    ):
+        candidates = candidates_at([(0.5, -0.2, 0.1), (0.2, 0.1, 0.6)], e1_px2)
+        selection = select(rule, belief(prior), candidates, snapshot)
+        metres = np.array(object_space_m2(candidates, prior, snapshot))
+        expected = weight[0] * e1_px2 + weight[1] * metres
+        np.testing.assert_allclose(selection.costs[:2], expected, rtol=1e-11)
+        assert metres[1] < metres[0]
+        assert int(selection.selected) == 1
+        # Without a prediction there is only the image.
+        first = select(rule, belief(prior, initialised=False), candidates, snapshot)
+        np.testing.assert_array_equal(first.costs[:2], e1_px2)
+        assert int(first.selected) == 0
 
 
 def test_mahalanobis_is_the_whitened_error():
@@ -468,20 +464,6 @@ def test_the_oracle_says_what_it_lacks():
     snapshot = dataclasses.replace(snapshot, obs=obs)
     with pytest.raises(ValueError, match="T_world_vehicle_true"):
         Oracle()(belief(worlds.planar(*TRUTH)), candidates_at(PAIR, [1.0, 5.0]), snapshot)
-
-
-def test_paper_cost_is_equations_13_and_14():
-    snapshot = seen_from((0.2, 0.1, 0.6), one_marker=False)
-    prior = worlds.planar(0.25, 0.05, 0.7)
-    candidates = candidates_at([(0.2, 0.1, 0.6), (0.5, -0.2, 0.1)], [4.0, 3.0])
-    selection = select(PaperCost(), belief(prior), candidates, snapshot)
-    metres = np.array(object_space_m2(candidates, prior, snapshot))
-    np.testing.assert_allclose(selection.costs[:2], [4.0, 3.0] + 100**2 * metres, rtol=1e-11)
-    assert int(selection.selected) == 0
-    # Before the first pose e is e1.
-    first = select(PaperCost(), belief(prior, initialised=False), candidates, snapshot)
-    np.testing.assert_array_equal(first.costs[:2], [4.0, 3.0])
-    assert int(first.selected) == 1
 
 
 @pytest.fixture(scope="module")

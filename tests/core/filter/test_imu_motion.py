@@ -54,7 +54,12 @@ def measured(seed=0, count=40, dt_s=0.005, still=False, noise=NOISE) -> Preinteg
     rng = np.random.default_rng(seed)
     gyro = np.array([0.4, -1.0, 0.7]) + 0.3 * rng.normal(size=(count, 3))
     accel = np.array([1.0, -2.0, 9.0]) + rng.normal(size=(count, 3))
-    rows = jnp.asarray(gyro), jnp.asarray(accel), jnp.full(count, dt_s), jnp.zeros(count, bool)
+    rows = (
+        jnp.asarray(gyro),
+        jnp.asarray(accel),
+        jnp.full(count, dt_s, float),
+        jnp.zeros(count, bool),
+    )
     return integrated(Readings(*rows, jnp.asarray(still)), noise)
 
 
@@ -62,7 +67,7 @@ def test_without_a_reading_it_is_the_constant_velocity_s():
     """And the biases walk."""
     (mean, P), some = random_state(), measured()
     nothing = jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), Preintegrated.none(), some)
-    broken = dataclasses.replace(some, velocity_mps=jnp.full(3, jnp.nan))
+    broken = dataclasses.replace(some, velocity_mps=jnp.full(3, jnp.nan, float))
     ours, plain = InertialMotion(NOISE), ConstantVelocity()
     theirs = predicted(plain, believing(plain, mean[:13], P[:12, :12]), at(0.2))
     for imu in (None, nothing, broken, measured(count=30)):  # the last is of another interval
@@ -183,7 +188,7 @@ def test_gtsam_s_combined_factor_has_the_same_mean_and_covariance_of_the_predict
     J = to_ours(R, v_world)
     ours_of = np.r_[0:9, 12:18]
     P[np.ix_(ours_of, ours_of)] = J @ before @ J.T
-    rows = jnp.asarray(gyro), jnp.asarray(accel), jnp.full(200, dt_s), jnp.zeros(200, bool)
+    rows = jnp.asarray(gyro), jnp.asarray(accel), jnp.full(200, dt_s, float), jnp.zeros(200, bool)
     readings = Readings(*rows, jnp.asarray(False))
     imu = integrated(readings, noise, jnp.asarray(gyro_bias), jnp.asarray(accel_bias))
     motion = InertialMotion(noise)
@@ -278,7 +283,11 @@ def test_rest_weighs_the_hypotheses_by_how_well_they_rest():
     side = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     means = np.stack([np.concatenate([q, np.zeros(3), first[0]]) for q in (side, [1, 0, 0, 0.0])])
     bank = believing(motion, means, P)
-    rows = jnp.zeros((20, 3)), jnp.tile(jnp.asarray([0, 0, 9.81]), (20, 1)), jnp.full(20, 0.01)
+    rows = (
+        jnp.zeros((20, 3)),
+        jnp.tile(jnp.asarray([0, 0, 9.81]), (20, 1)),
+        jnp.full(20, 0.01, float),
+    )
     imu = integrated(Readings(*rows, jnp.zeros(20, bool), jnp.asarray(True)), NOISE)
     weights = np.exp(np.asarray(predicted(motion, bank, at(0.2, imu)).log_weight))
     assert weights.sum() == pytest.approx(1)
@@ -314,7 +323,7 @@ def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
 
     zero = jnp.zeros((4, 3))
     for still in (True, False):
-        for dt_s in (jnp.full(4, 0.01), jnp.zeros(4)):
+        for dt_s in (jnp.full(4, 0.01, float), jnp.zeros(4)):
             floats = InertialMotion(), jnp.zeros(22), zero, zero, dt_s
             for leaf in jax.tree.leaves(slope(floats, jnp.asarray(still))):
                 assert np.all(np.isfinite(leaf))

@@ -1,11 +1,14 @@
 """The fixed-lag smoother of `Navigator(lag_s=...)` against a pass back from the end."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.filter.smooth import Trail
@@ -14,18 +17,23 @@ from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.helpers.filters import sense
 
+BANK = pytest.param(MultiHypothesis(hypotheses=8), marks=pytest.mark.long)
 FRAMES, DT_S, LAG_S, SIGMA_PX = 24, 0.1, 0.8, 0.2
 
 
-def navigator(**further) -> Navigator:
-    return Navigator(
-        worlds.qcar_rig(),
-        worlds.paper_markers(),
-        motion=ConstantVelocity(),
-        selector=MultiHypothesis(hypotheses=8),
-        corner_sigma_px=SIGMA_PX,
-        **further,
-    )
+@pytest.fixture(scope="module", params=[LowestReprojection(), BANK], ids=["rule", "bank"])
+def navigator(request) -> Callable[..., Navigator]:
+    def made(**further):
+        return Navigator(
+            worlds.qcar_rig(),
+            worlds.paper_markers(),
+            motion=ConstantVelocity(),
+            selector=request.param,
+            corner_sigma_px=SIGMA_PX,
+            **further,
+        )
+
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -56,12 +64,12 @@ def run(navigator, obs):
 
 
 @pytest.fixture(scope="module")
-def filtered(drive):
+def filtered(navigator, drive):
     return jax.device_get(run(navigator(), drive[0]))
 
 
 @pytest.fixture(scope="module")
-def lagged(drive):
+def lagged(navigator, drive):
     return jax.device_get(run(navigator(lag_s=LAG_S, lag_observations=16), drive[0]))
 
 
@@ -77,7 +85,7 @@ def test_a_lag_leaves_the_filter_as_it_is(filtered, lagged):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_lagged_pose_is_that_of_a_pass_back_from_the_present(drive, lagged):
+def test_a_lagged_pose_is_that_of_a_pass_back_from_the_present(navigator, drive, lagged):
     """From every fifth frame back, over the three in which no marker is seen as well."""
     motion, (obs, _), (belief, out) = navigator().motion, drive, lagged
     at = lambda tree, frame: jax.tree.map(lambda leaf: leaf[frame], tree)  # noqa: E731
@@ -108,6 +116,6 @@ def test_a_lagged_pose_is_nearer_to_the_truth_and_says_so(drive, lagged):
 
 
 @pytest.mark.parametrize("lag", [{"lag_s": -1.0}, {"lag_s": float("nan")}, {"lag_observations": 0}])
-def test_a_lag_is_a_time_and_some_observations(lag):
+def test_a_lag_is_a_time_and_some_observations(navigator, lag):
     with pytest.raises(ValueError, match="no lag"):
         navigator(**lag)

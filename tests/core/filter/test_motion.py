@@ -581,7 +581,7 @@ def test_a_twist_that_is_no_motion_is_not_used():
 
 def test_constant_velocity_converges_on_a_moving_body():
     """Noisy poses of a body that screws through space: pose and twist are found, errors as said."""
-    motion = ConstantVelocity(acceleration_density=jnp.full(6, 0.05**2))
+    motion = ConstantVelocity(acceleration_density=jnp.full(6, 0.05**2, float))
     rng = np.random.default_rng(4)
     twist = jnp.asarray([0.5, 0.1, -0.2, 0.2, -0.1, 0.6])
     T = jaxlie.SE3.identity()

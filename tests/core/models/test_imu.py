@@ -27,12 +27,11 @@ NOISE = ImuNoise(2e-3, 3e-2, 4e-3, 5e-2, 0.05, 0.2)
 run = eqx.filter_jit(preintegrate)
 
 
-def readings(gyro, accel, dt_s, bridged=None) -> Readings:
+def readings(gyro, accel, dt_s, still=False) -> Readings:
     count = len(gyro)
-    bridged = np.zeros(count, bool) if bridged is None else bridged
     dt = jnp.broadcast_to(jnp.asarray(dt_s, float), (count,))
     numbers = jnp.asarray(gyro, float), jnp.asarray(accel, float), dt
-    return Readings(*numbers, jnp.asarray(bridged), jnp.asarray(False))
+    return Readings(*numbers, jnp.zeros(count, bool), jnp.asarray(still))
 
 
 def random_readings(count=20, seed=0):
@@ -371,7 +370,7 @@ def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
 
     zero = jnp.zeros((4, 3))
     slope = jax.jit(jax.grad(total, argnums=(0, 1)))
-    for dt_s in (jnp.full(4, 0.01), jnp.zeros(4), jnp.full(4, jnp.nan)):
+    for dt_s in (jnp.full(4, 0.01, float), jnp.zeros(4), jnp.full(4, jnp.nan, float)):
         for leaf in jax.tree.leaves(slope((zero, zero), dt_s)):
             assert leaf.dtype == precision
             assert np.all(np.isfinite(leaf)) or np.isnan(dt_s[0])

@@ -284,7 +284,7 @@ def seen(navigator: Navigator, moved: dict[int, tuple] | None = None, seed=0) ->
     shape = (4, 3, 4, 2)
     noise_px = jnp.asarray(0.3 * np.random.default_rng(seed).standard_normal(shape))
     obs = worlds.observe(navigator.rig, true, worlds.planar(*worlds.FRONT_VIEW), noise_px)
-    sigma_px = jnp.full(shape[:3], 0.3)
+    sigma_px = jnp.full(shape[:3], 0.3, float)
     return eqx.tree_at(
         lambda o: o.corner_sigma_px, obs, sigma_px, is_leaf=lambda leaf: leaf is None
     )

@@ -174,7 +174,7 @@ def awkward_corners() -> np.ndarray:
 @in_float32
 def test_gradients_are_finite_everywhere_and_corners_of_no_square_have_a_large_error(precision):
     corners = jnp.asarray(awkward_corners(), precision)
-    size = jnp.full(len(corners), 0.2)
+    size = jnp.full(len(corners), 0.2, float)
 
     @jax.jit
     @jax.vmap

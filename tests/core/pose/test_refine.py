@@ -195,7 +195,7 @@ def test_no_visible_corner_is_a_result(precision):
     rig, markers = worlds.qcar_rig(), worlds.room_markers()
     start = worlds.planar(0.4, -0.3, 1.0).inverse()
     for filler in (0.0, np.nan):
-        corners = jnp.full((4, 4, 4, 2), filler)
+        corners = jnp.full((4, 4, 4, 2), filler, float)
         refined = refine(rig, markers, corners, jnp.zeros((4, 4), bool), start)
         assert not refined.converged
         assert refined.cost == 0
@@ -295,12 +295,12 @@ def test_gradients_are_finite_and_the_start_and_hidden_lanes_have_none(precision
             jnp.sum(refined.T_vehicle_world.wxyz_xyz) + refined.cost + jnp.sum(refined.covariance)
         )
 
-    nan, none = jnp.full((4, 4, 4, 2), jnp.nan), jnp.zeros((4, 4), bool)
+    nan, none = jnp.full((4, 4, 4, 2), jnp.nan, float), jnp.zeros((4, 4), bool)
     for T in (worlds.planar(*VIEW), worlds.planar(0.1, -0.4, np.pi / 2)):
         obs = worlds.observe(rig, markers, T)
         for corners_px, visible in ((obs.corners_px, obs.visible), (nan, obs.visible), (nan, none)):
             for off in (0.0, 0.01):
-                by_corner, by_start = gradients(corners_px, visible, T, jnp.full(6, off))
+                by_corner, by_start = gradients(corners_px, visible, T, jnp.full(6, off, float))
                 np.testing.assert_array_equal(by_start, 0)
                 assert by_corner.dtype == by_start.dtype == precision
                 assert np.all(np.isfinite(by_corner))
