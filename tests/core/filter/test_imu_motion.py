@@ -21,7 +21,7 @@ from jaxnav.core.models.imu import (
 )
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
-from tests.core.models.test_imu import gtsam_of, need_gtsam
+from tests.core.models.test_imu import gtsam_of, need_gtsam, readings
 from tests.derivatives import in_float32
 from tests.helpers.filters import believing, predicted
 from tests.reference.rigid import matrix, twist_matrix, wxyz_xyz
@@ -50,17 +50,11 @@ def random_state(seed=0, size=0.01):
     return mean, root @ root.T + 1e-10 * np.eye(21)
 
 
-def measured(seed=0, count=40, dt_s=0.005, still=False, noise=NOISE) -> Preintegrated:
+def measured(seed=0, count=40, dt_s=0.005) -> Preintegrated:
     rng = np.random.default_rng(seed)
     gyro = np.array([0.4, -1.0, 0.7]) + 0.3 * rng.normal(size=(count, 3))
     accel = np.array([1.0, -2.0, 9.0]) + rng.normal(size=(count, 3))
-    rows = (
-        jnp.asarray(gyro),
-        jnp.asarray(accel),
-        jnp.full(count, dt_s, float),
-        jnp.zeros(count, bool),
-    )
-    return integrated(Readings(*rows, jnp.asarray(still)), noise)
+    return integrated(readings(gyro, accel, dt_s), NOISE)
 
 
 def test_without_a_reading_it_is_the_constant_velocity_s():
@@ -188,9 +182,9 @@ def test_gtsam_s_combined_factor_has_the_same_mean_and_covariance_of_the_predict
     J = to_ours(R, v_world)
     ours_of = np.r_[0:9, 12:18]
     P[np.ix_(ours_of, ours_of)] = J @ before @ J.T
-    rows = jnp.asarray(gyro), jnp.asarray(accel), jnp.full(200, dt_s, float), jnp.zeros(200, bool)
-    readings = Readings(*rows, jnp.asarray(False))
-    imu = integrated(readings, noise, jnp.asarray(gyro_bias), jnp.asarray(accel_bias))
+    imu = integrated(
+        readings(gyro, accel, dt_s), noise, jnp.asarray(gyro_bias), jnp.asarray(accel_bias)
+    )
     motion = InertialMotion(noise)
     after = predicted(motion, believing(motion, mean, P), at(0.2, imu))
 
@@ -248,10 +242,8 @@ def test_a_body_at_rest_tells_the_gyroscope_s_bias_and_the_lean_of_the_map():
     motion = InertialMotion(NOISE)
     bias, lean = np.array([0.04, -0.03, 0.02]), np.deg2rad(2.0)
     gravity = 9.81 * np.array([np.sin(lean), 0, -np.cos(lean)])
-    rows = np.tile(bias, (20, 1)), np.tile(-gravity, (20, 1)), np.full(20, 0.005)
-    numbers = [jnp.asarray(row, float) for row in rows]
-    readings = Readings(*numbers, jnp.zeros(20, bool), jnp.asarray(True))
-    imu = integrated(readings, NOISE)
+    rows = np.tile(bias, (20, 1)), np.tile(-gravity, (20, 1))
+    imu = integrated(readings(*rows, 0.005, True), NOISE)
     first = motion.at_first()
     mean = np.concatenate([[1, 0, 0, 0, 0, 0, 0], first[0]])
     P = np.zeros((21, 21))
@@ -283,12 +275,7 @@ def test_rest_weighs_the_hypotheses_by_how_well_they_rest():
     side = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     means = np.stack([np.concatenate([q, np.zeros(3), first[0]]) for q in (side, [1, 0, 0, 0.0])])
     bank = believing(motion, means, P)
-    rows = (
-        jnp.zeros((20, 3)),
-        jnp.tile(jnp.asarray([0, 0, 9.81]), (20, 1)),
-        jnp.full(20, 0.01, float),
-    )
-    imu = integrated(Readings(*rows, jnp.zeros(20, bool), jnp.asarray(True)), NOISE)
+    imu = integrated(readings(np.zeros((20, 3)), np.tile([0, 0, 9.81], (20, 1)), 0.01, True), NOISE)
     weights = np.exp(np.asarray(predicted(motion, bank, at(0.2, imu)).log_weight))
     assert weights.sum() == pytest.approx(1)
     assert weights[0] < 0.01
