@@ -34,10 +34,7 @@ def navigator(**options) -> Navigator:
     """The paper's rule, unless told otherwise: the bank has tests of its own."""
     options = {"selector": PaperCost(), "waypoints_m": worlds.WAYPOINTS_M} | options
     return Navigator(
-        rig=worlds.qcar_rig(),
-        markers=worlds.paper_markers(),
-        vehicle=worlds.qcar(),
-        **options,
+        rig=worlds.qcar_rig(), markers=worlds.paper_markers(), vehicle=worlds.qcar(), **options
     )
 
 
@@ -102,10 +99,7 @@ def test_step_scan_and_vmap_agree():
             for leaf, value in zip(jax.tree.leaves(told(other)), expected, strict=True):
                 np.testing.assert_allclose(leaf, value, rtol=1e-7, atol=1e-7)
             np.testing.assert_allclose(
-                of_all_lanes(other[1]),
-                of_all_lanes(alone[index][1]),
-                rtol=1e-5,
-                atol=1e-6,
+                of_all_lanes(other[1]), of_all_lanes(alone[index][1]), rtol=1e-5, atol=1e-6
             )
 
 

@@ -149,8 +149,7 @@ given_slots = jax.jit(give_slots)
 
 
 @given(
-    st.lists(st.booleans(), min_size=4, max_size=4),
-    st.lists(st.booleans(), min_size=6, max_size=6),
+    st.lists(st.booleans(), min_size=4, max_size=4), st.lists(st.booleans(), min_size=6, max_size=6)
 )
 def test_every_second_pose_gets_an_empty_slot_of_its_own(wanted, empty):
     xi = np.arange(1, 13, dtype=float).reshape(4, 3)

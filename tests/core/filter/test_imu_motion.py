@@ -13,12 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxnav.core.filter.free import ConstantVelocity
 from jaxnav.core.filter.imu import InertialMotion
-from jaxnav.core.models.imu import (
-    ImuNoise,
-    Preintegrated,
-    Readings,
-    preintegrate,
-)
+from jaxnav.core.models.imu import ImuNoise, Preintegrated, Readings, preintegrate
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.core.models.test_imu import gtsam_of, need_gtsam, readings

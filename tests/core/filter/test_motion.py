@@ -17,15 +17,7 @@ from jaxnav.core.filter.motion import Motion
 from jaxnav.core.filter.planar import BicycleKalman
 from tests import worlds
 from tests.derivatives import in_float32
-from tests.helpers.filters import (
-    believing,
-    chosen,
-    level,
-    planar_part,
-    predicted,
-    reading,
-    stepped,
-)
+from tests.helpers.filters import believing, chosen, level, planar_part, predicted, reading, stepped
 from tests.reference import kalman, paper
 from tests.reference.rigid import matrix
 
@@ -88,12 +80,7 @@ def test_200_steps_are_the_textbook_s(with_pose):
             np.asarray(motion.odometry_sigma),
         )
         _, belief, nis = drive_step(
-            motion,
-            belief,
-            pose,
-            root @ root.T,
-            sees,
-            reading(speed, steering, dt_s=dt_s),
+            motion, belief, pose, root @ root.T, sees, reading(speed, steering, dt_s=dt_s)
         )
         np.testing.assert_allclose(kalman.wrap(belief.mean[0, 2] - x[2]), 0, atol=1e-9)
         np.testing.assert_allclose(np.delete(belief.mean[0], 2), np.delete(x, 2), atol=1e-9)
@@ -136,12 +123,7 @@ def test_the_yaw_innovation_wraps():
     tight = 1e-6 * np.eye(6)
     belief = started(motion, (0.0, 0.0, np.pi - 0.02), tight, 0.0, 0.0)
     _, posterior, nis = drive_step(
-        motion,
-        belief,
-        (0.0, 0.0, -np.pi + 0.02),
-        tight,
-        True,
-        reading(dt_s=0.0),
+        motion, belief, (0.0, 0.0, -np.pi + 0.02), tight, True, reading(dt_s=0.0)
     )
     assert abs(kalman.wrap(float(posterior.mean[0, 2]) - np.pi)) < 0.02
     variance = 1e-6 + float(motion.vision_floor[2]) ** 2
@@ -182,12 +164,7 @@ def test_nis_of_a_matched_filter_is_chi_square():
         x = kalman.predict(x, zero, dt_s, density)[0] + rng.multivariate_normal(np.zeros(6), Q)
         pose = rng.multivariate_normal(x[:3], R)
         _, belief, nis = drive_step(
-            motion,
-            belief,
-            pose,
-            covariance,
-            True,
-            reading(has_odometry=False, dt_s=dt_s),
+            motion, belief, pose, covariance, True, reading(has_odometry=False, dt_s=dt_s)
         )
         values.append(float(nis[0]))
     assert values[0] == 0

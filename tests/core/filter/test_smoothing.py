@@ -101,11 +101,7 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
     )
     nominal = np.zeros((STEPS, 6))
     nominal[:, 0], nominal[:, 3] = DT_S * np.arange(STEPS), 1
-    P, R, H = (
-        np.diag([0.1] * 3 + [0.5] * 3) ** 2,
-        np.diag([0.02, 0.03, 0.01]) ** 2,
-        np.eye(3, 6),
-    )
+    P, R, H = (np.diag([0.1] * 3 + [0.5] * 3) ** 2, np.diag([0.02, 0.03, 0.01]) ** 2, np.eye(3, 6))
     z = small * rng.normal(size=(STEPS, 3))
 
     @jax.jit

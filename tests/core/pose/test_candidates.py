@@ -258,8 +258,7 @@ def test_on_the_ground_the_minimum_is_scipy_s(pose):
 @pytest.fixture(scope="module")
 def navigator() -> Navigator:
     markers = worlds.marker_map(
-        [(worlds.upright(-np.pi / 2), [x_m, 1.47, 0.226]) for x_m in (-0.5, 0.0, 0.5)],
-        [0.172] * 3,
+        [(worlds.upright(-np.pi / 2), [x_m, 1.47, 0.226]) for x_m in (-0.5, 0.0, 0.5)], [0.172] * 3
     )
     return Navigator(worlds.qcar_rig(), markers, corner_sigma_px=0.3)
 

@@ -74,7 +74,7 @@ def test_the_closed_form_is_that_of_one_marker(precision):
     clear = clear & (np.arange(BATCH) < 40)
     assert np.sum(clear) > 20
     angles = worlds.rotation_angles_rad(
-        *(matrix(one.T_camera_marker.wxyz_xyz)[clear, :, :3, :3] for one in (pair, expected)),
+        *(matrix(one.T_camera_marker.wxyz_xyz)[clear, :, :3, :3] for one in (pair, expected))
     )
     assert np.max(angles) < 100 * eps
 
