@@ -115,8 +115,6 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     corners = snapshot.markers.corners_world_m[snapshot.seen.marker_index].reshape(-1, 3)
     T_prior = jaxlie.SE3(prior.T_world_vehicle.wxyz_xyz[0])
     e = prior.errors.mean.shape[1]
-    H = np.zeros((3 + e, bank.mean.shape[1]))
-    H[3:, SENSORS_END:] = np.eye(e)
     P = np.block(
         [
             [PLANAR.T @ prior.covariance[0] @ PLANAR, PLANAR.T @ prior.errors.cross[0]],
