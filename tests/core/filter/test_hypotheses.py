@@ -512,7 +512,7 @@ def parked(sigma_px: float) -> Seen:
 
 
 @pytest.mark.long
-def test_a_parked_car_far_away_does_not_know_at_first_and_says_so():
+def test_a_parked_car_whose_image_says_nothing_stays_undecided():
     """One look does not tell the poses apart. Many, of independent noise, may in the end; of
     corners that are four times worse, the five seconds are over before it could know."""
     seen, worse = parked(1.0), parked(4.0)
@@ -627,8 +627,9 @@ def test_a_bank_without_room_for_a_fan_or_in_which_one_frame_decides_is_refused(
     MultiHypothesis(outlier_log_evidence=float(np.log(3e-5)) + 1e-6, decided_mass=3e-5)
 
 
-def test_ten_rejected_frames_start_a_new_fan_and_it_recovers():
-    """Carried off after 2 s, by a metre and a quarter turn; the wheels tell nothing of it."""
+def test_it_recovers_from_being_carried_off():
+    """After 2 s, by a metre and a quarter turn; the wheels tell nothing of it. Ten rejected frames
+    start a new fan."""
     frame, patience = 30, car().motion.max_rejections
     before = arc((1.2, 0.2, np.deg2rad(170.0)), 0.3, 0.0, frame)
     after = arc((-0.9, -0.4, np.deg2rad(20.0)), 0.3, 0.0, FRAMES - frame)

@@ -65,7 +65,7 @@ def test_planar_pose_is_a_turn_about_z(precision):
 def test_planar_poses_and_points_over_batches():
     rng = np.random.default_rng(0)
     T_a_b = jaxlie.SE3(jnp.asarray(wxyz_xyz(cayley(rng.normal(size=6)))))
-    R, t = matrix(T_a_b.wxyz_xyz)[:3, :3], T_a_b.wxyz_xyz[4:]
+    R, t = matrix(T_a_b.wxyz_xyz)[:3, :3], np.asarray(T_a_b.wxyz_xyz)[4:]
     for batch in ((), (3, 1, 2)):
         poses = jnp.asarray(rng.uniform(-3, 3, (*batch, 3)))
         lifted = geometry.T_world_vehicle_from_planar(poses)

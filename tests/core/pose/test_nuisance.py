@@ -15,7 +15,7 @@ from jaxnav.core.pose.observation import sightings
 from jaxnav.core.pose.refine import Candidates, refine_pose
 from jaxnav.core.pose.residuals import Nuisance, camera_slopes
 from tests import worlds
-from tests.derivatives import check_derivatives
+from tests.derivatives import check_derivatives, in_float32
 from tests.reference.rigid import inverse_cayley, matrix, wxyz_xyz
 
 VIEW = (0.2, 0.1, 0.6)  # of the room: three cameras, four markers
@@ -209,7 +209,8 @@ def test_a_camera_that_is_off_by_a_degree_turns_itself_and_not_the_vehicle():
     assert exact.cost > 100
 
 
-def test_the_covariance_covers_the_cameras_errors():
+@in_float32
+def test_the_covariance_covers_the_cameras_errors(precision):
     """200 draws of all cameras' errors and of the corners' noise, in a room: NEES is chi-square."""
     rig, markers = worlds.qcar_rig(), worlds.room_markers()
     T_world_vehicle = worlds.planar(*VIEW)
@@ -232,7 +233,9 @@ def test_the_covariance_covers_the_cameras_errors():
 
         return jax.vmap(one)(Ts, noise)
 
-    xi, covariance, converged = map(np.asarray, run(uncertain(rig)))
+    told = run(uncertain(rig))
+    assert {leaf.dtype for leaf in told[:2]} == {np.dtype(precision)}
+    xi, covariance, converged = (np.asarray(leaf, float) for leaf in told)
     assert np.all(converged)
     nees = np.einsum("ni,nij,nj->n", xi, np.linalg.inv(covariance), xi)
     assert abs(np.mean(nees) - 6) < 4 * np.sqrt(12 / count)
@@ -317,17 +320,3 @@ def test_gradients_are_differences():
 
     arguments = (obs.corners_px + noise, jnp.zeros((4, 6)), jnp.ones((4, 6)))
     check_derivatives(estimate, *arguments, step=1e-5, rtol=1e-4, atol=1e-6)
-
-
-def test_float32_finds_the_pose_too(precision):
-    rig, markers = worlds.qcar_rig(), worlds.room_markers()
-    T_world_vehicle = worlds.planar(*VIEW)
-    off = SIGMA * np.random.default_rng(8).standard_normal((4, 6))
-    obs = worlds.observe(moved(rig, off), markers, T_world_vehicle)
-    refined = refine(
-        uncertain(rig), markers, obs.corners_px, obs.visible, T_world_vehicle.inverse(), SIGMA_PX
-    )
-    assert refined.converged
-    assert refined.covariance.dtype == refined.T_vehicle_world.wxyz_xyz.dtype == precision
-    xi = errors_of(T_world_vehicle, refined)
-    assert xi @ np.linalg.solve(refined.covariance, xi) < stats.chi2(6).ppf(0.9999)
