@@ -229,8 +229,8 @@ class TestEverySelector:
             np.testing.assert_array_equal(selection.log_weight, prior.log_weight)
 
 
-# The bank's are those of a step, in test_hypotheses.py; what the long ones differentiate the paper's
-# cost does too.
+# The bank's are those of a step, in test_hypotheses.py. What the long ones differentiate the
+# paper's cost does too.
 @pytest.mark.parametrize(
     "selector",
     but_long(LowestReprojection, RatioTest, ObjectSpace, Oracle, Ungated)[:-1],
