@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -445,28 +447,26 @@ def _car(precision: str) -> Navigator:
     return make_setup().navigator()
 
 
-def run(nav: Navigator, obs: Observation) -> Seen:
-    def looked(state, out) -> Seen:
+def run(nav: Navigator, obs: Observation, seeds: Sequence[int] = range(SEEDS)) -> Seen:
+    """Of some of the drives."""
+    seen, state = [], None
+    for seed, frame in itertools.product(seeds, range(FRAMES)):
+        state = state if frame else nav.init()
+        given = jax.tree.map(lambda leaf, at=(seed, frame): leaf[at], obs)
+        state, out = step(nav, state, given)
         bank = state.belief.bank
-        return Seen(
-            pose=out.pose,
-            hypothesis=out.hypothesis,
-            decided=out.decided,
-            flip_probability=out.flip_probability,
-            nis=out.nis,
-            hypotheses=np.sum(bank.initialised),
-            rejections=np.max(np.where(bank.initialised, bank.rejections.count, 0)),
-            started=out.located,
-        )
-
-    seen = []
-    for seed in range(SEEDS):
-        state = nav.init()
-        for frame in range(FRAMES):
-            given = jax.tree.map(lambda leaf, at=(seed, frame): leaf[at], obs)
-            state, out = step(nav, state, given)
-            seen.append(looked(*jax.device_get((state, out))))
-    return jax.tree.map(lambda *x: np.stack(x).reshape(SEEDS, FRAMES, *x[0].shape), *seen)
+        told = (
+            out.pose, out.hypothesis, out.decided, out.flip_probability, out.nis, bank.initialised,
+            bank.rejections.count, out.located,
+        )  # fmt: skip
+        seen.append(Seen(*jax.device_get(told)))
+    shape = len(seeds), FRAMES
+    seen = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *x[0].shape), *seen)
+    return dataclasses.replace(
+        seen,
+        hypotheses=np.sum(seen.hypotheses, axis=2),
+        rejections=np.max(np.where(seen.hypotheses, seen.rejections, 0), axis=2),
+    )
 
 
 def sensed(poses, speed_mps, steering_rad=0.0, sigma_px=1.0, seed=0) -> Observation:
@@ -557,14 +557,14 @@ def test_wheels_that_slip_choose_no_branch(seed):
     poses = arc((2.0, -1.0, np.deg2rad(125.0)), 0.5, -0.4)
     slipping = sensed(poses, 1.1 * 0.5, -0.4, seed=seed)
 
-    def wrong_once_decided(max_inflation: float) -> np.ndarray:
+    def wrong_once_decided(max_inflation: float, *seeds: int) -> np.ndarray:
         nav = eqx.tree_at(lambda n: n.selector.max_inflation, car(), max_inflation)
-        seen = run(nav, slipping)
+        seen = run(nav, slipping, seeds)
         assert np.all(np.any(seen.decided, axis=1))
         return (errors_of(seen, poses)[1] > np.deg2rad(20)) & np.asarray(seen.decided)
 
-    assert not np.any(wrong_once_decided(car().selector.max_inflation))
-    assert np.any(wrong_once_decided(1.0))
+    assert not np.any(wrong_once_decided(car().selector.max_inflation, *range(SEEDS)))
+    assert any(np.any(wrong_once_decided(1.0, seed)) for seed in range(SEEDS))
 
 
 def test_one_gross_outlier_changes_nothing():
@@ -572,13 +572,13 @@ def test_one_gross_outlier_changes_nothing():
     corners were mixed up."""
     poses, frame = arc((1.2, 0.2, np.deg2rad(170.0)), 0.3, 0.0), 40
     obs = sensed(poses, 0.3)
-    clean = run(car(), obs)
+    clean = run(car(), obs, range(4))
     assert np.all(clean.decided[:, frame - 1 :])
     assert np.max(errors_of(clean, poses)[0][:, frame - 1 :]) < 0.05
     corners_px = obs.corners_px.copy()
     corners_px[::2, frame] += [60.0, -25.0]
     corners_px[1::2, frame] = np.roll(corners_px[1::2, frame], 1, axis=3)
-    spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, corners_px))
+    spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, corners_px), range(4))
     assert np.all(spoilt.nis[:, frame] > 100)
     assert np.all(spoilt.rejections[:, frame] == 1)
     assert np.all(spoilt.rejections[:, frame + 1] == 0)
@@ -634,9 +634,9 @@ def test_it_recovers_from_being_carried_off():
     before = arc((1.2, 0.2, np.deg2rad(170.0)), 0.3, 0.0, frame)
     after = arc((-0.9, -0.4, np.deg2rad(20.0)), 0.3, 0.0, FRAMES - frame)
     poses = np.concatenate([before, after])
-    seen = run(car(), sensed(poses, 0.3))
+    seen = run(car(), sensed(poses, 0.3), range(4))
     rejected = seen.rejections[:, frame - 1 : frame + patience + 1]
-    np.testing.assert_array_equal(rejected, [[*range(patience + 1), 0]] * SEEDS)
+    np.testing.assert_array_equal(rejected, [[*range(patience + 1), 0]] * 4)
     assert np.all(seen.hypotheses[:, frame + patience] > seen.hypotheses[:, frame - 1])
     position_m, _ = errors_of(seen, poses)
     assert np.max(position_m[:, frame - 1]) < 0.05
