@@ -127,9 +127,12 @@ def handheld_rig() -> CameraRig:
     )
 
 
+from_planar = jax.jit(T_world_vehicle_from_planar)
+
+
 def planar(x_m: float, y_m: float, psi_rad: float) -> jaxlie.SE3:
     """T_world_vehicle of a car."""
-    return T_world_vehicle_from_planar(jnp.asarray([x_m, y_m, psi_rad], float))
+    return from_planar(jnp.asarray([x_m, y_m, psi_rad], float))
 
 
 def faces(rig: CameraRig, markers: MarkerMap, T_world_vehicle: jaxlie.SE3) -> jax.Array:

@@ -96,10 +96,7 @@ def test_the_arc_meets_the_waypoint(direction_deg, distance_m):
     heading = 2.9
     pose = (0.3, -0.2, heading)
     direction = heading + np.deg2rad(direction_deg)
-    waypoint = (
-        pose[0] + distance_m * np.cos(direction),
-        pose[1] + distance_m * np.sin(direction),
-    )
+    waypoint = (pose[0] + distance_m * np.cos(direction), pose[1] + distance_m * np.sin(direction))
     steering = self_consistent_steering(pose, waypoint)
     assert abs(steering) < 0.5
     _, command, _, _ = act(controller([waypoint]), pose, steering)

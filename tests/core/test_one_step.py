@@ -1,4 +1,4 @@
-"""The car's compiled program makes the same of events as a scan of `step`."""
+"""The car's compiled program makes the same of events as `step`."""
 
 import operator
 from functools import partial
@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.filter.hypotheses import MultiHypothesis
 from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.drive.estimator import Estimator
 from jaxnav.drive.history import EventData
 from tests import worlds
+from tests.helpers.filters import sense, step
+from tests.helpers.simulated import make_setup
 from tests.reference import paper
 
 # Relative beyond 1; both are 0 as a rule.
@@ -44,12 +45,7 @@ def seen() -> Observation:
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
     noise_px = SIGMA_PX * np.random.default_rng(3).standard_normal((STEPS, 4, 1, 4, 2))
 
-    @jax.jit
-    @jax.vmap
-    def look(pose, noise_px):
-        return worlds.observe(rig, markers, worlds.T_world_vehicle_from_planar(pose), noise_px)
-
-    obs = look(jnp.asarray(poses()), jnp.asarray(noise_px))
+    obs = sense(rig, markers, jnp.asarray(poses()), jnp.asarray(noise_px))
     lit = ~np.isin(np.arange(STEPS), TUNNEL)
     dt_s = np.full(STEPS, PERIOD_US) * 1e-6
     dt_s[0] = 0
@@ -71,17 +67,6 @@ def seen() -> Observation:
     )
 
 
-def navigator(**options) -> Navigator:
-    options = {"selector": MultiHypothesis(hypotheses=12), "max_sightings": 2} | options
-    return Navigator(
-        worlds.qcar_rig(),
-        worlds.paper_markers(),
-        worlds.qcar(),
-        worlds.WAYPOINTS_M,
-        **options,
-    )
-
-
 def by_the_car(nav: Navigator, seen: Observation) -> list:
     """What was known after every event, as the loop calls it."""
     estimator, known = Estimator(nav), []
@@ -96,13 +81,12 @@ def by_the_car(nav: Navigator, seen: Observation) -> list:
 
 
 def by_step(nav: Navigator, seen: Observation):
-    """(belief, output), leading axis (STEPS,)."""
-
-    def step(state, obs):
-        state, output = nav.step(state, obs)
-        return state, (state.belief, output)
-
-    return jax.device_get(jax.jit(lambda obs: jax.lax.scan(step, nav.init(), obs)[1])(seen))
+    """(belief, output) after each step."""
+    state, known = nav.init(), []
+    for index in range(STEPS):
+        state, output = step(nav, state, jax.tree.map(operator.itemgetter(index), seen))
+        known.append(jax.device_get((state.belief, output)))
+    return known
 
 
 def without_empty_slots(belief, output) -> list[tuple[str, np.ndarray]]:
@@ -123,12 +107,12 @@ def without_empty_slots(belief, output) -> list[tuple[str, np.ndarray]]:
     return [(jax.tree_util.keystr(path), np.asarray(leaf)) for path, leaf in leaves]
 
 
-def farthest(known: list, scanned) -> tuple[float, str]:
+def farthest(known: list, stepped: list) -> tuple[float, str]:
     """By how much the two differ at most: absolute, beyond 1 relative."""
     worst = (0.0, "")
-    for index, fused in enumerate(known):
+    for index, (fused, by_hand) in enumerate(zip(known, stepped, strict=True)):
         one = without_empty_slots(fused.belief, fused.output)
-        other = without_empty_slots(*jax.tree.map(operator.itemgetter(index), scanned))
+        other = without_empty_slots(*by_hand)
         for (name, a), (_, b) in zip(one, other, strict=True):
             differs = a != b  # infinities too
             gap = np.abs(a[differs].astype(float) - b[differs]) / np.maximum(np.abs(b[differs]), 1)
@@ -142,7 +126,7 @@ def test_the_cars_program_is_step(seen, precision, tolerance):
     seen = jax.tree.map(
         lambda leaf: leaf.astype(precision) if np.issubdtype(leaf.dtype, float) else leaf, seen
     )
-    nav = navigator()
+    nav = make_setup().navigator()
     known = by_the_car(nav, seen)
     assert known[0].output.pose.dtype == precision
     gap, where = farthest(known, by_step(nav, seen))

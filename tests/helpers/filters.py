@@ -9,9 +9,13 @@ import numpy as np
 
 from jaxnav.core.filter.bank import Bank
 from jaxnav.core.filter.choose import MeasuredPose, Selection
+from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.pose.candidates import find_candidates
 from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
+from tests import worlds
+from tests.reference import paper
+from tests.reference.rigid import matrix
 
 
 def believing(motion, means, covariances, weights=None) -> Bank:
@@ -19,7 +23,7 @@ def believing(motion, means, covariances, weights=None) -> Bank:
     means, P = jnp.asarray(means, float), jnp.asarray(covariances, float)
     means, P = means.reshape(-1, means.shape[-1]), P.reshape(-1, *P.shape[-2:])
     count = len(means)
-    share = jnp.full(count, 1 / count) if weights is None else jnp.asarray(weights, float)
+    share = jnp.full(count, 1 / count, float) if weights is None else jnp.asarray(weights, float)
     return dataclasses.replace(
         motion.init(count),
         mean=means,
@@ -100,3 +104,47 @@ def find(snapshot: Snapshot) -> Candidates:
 def select(selector, prior, candidates, snapshot) -> Selection:
     """What a selector makes of them."""
     return selector(prior, candidates, snapshot)
+
+
+snap = jax.jit(Snapshot.create, static_argnames="max_sightings")
+step = jax.jit(lambda navigator, state, obs: navigator.step(state, obs))
+
+
+@jax.jit
+def sense(rig, markers, poses, noise_px, speed_mps=0.0, steering_rad=0.0, dt_s=0.0) -> Observation:
+    """What a car sees and reads at planar poses (..., 3), with noise (..., C, M, 4, 2)."""
+
+    def one(pose, noise_px, *numbers):
+        told = dict(zip(("speed_mps", "steering_rad", "dt_s"), numbers, strict=True))
+        return worlds.observe(rig, markers, T_world_vehicle_from_planar(pose), noise_px, **told)
+
+    lead = poses.shape[:-1]
+    for _ in lead:
+        one = jax.vmap(one)
+    numbers = (
+        jnp.broadcast_to(jnp.asarray(x, float), lead) for x in (speed_mps, steering_rad, dt_s)
+    )
+    return one(poses, noise_px, *numbers)
+
+
+def whitened_pixels(snapshot: Snapshot, T_world_vehicle: np.ndarray) -> np.ndarray:
+    """Projected less observed corners over sigma, in loops over the paper's equations."""
+    rig, obs = snapshot.rig, snapshot.obs
+    corners = np.asarray(snapshot.markers.corners_world_m)[0]
+    sigma_px = float(snapshot.seen.sigma_px[0, 0])
+    residuals = []
+    for j in np.flatnonzero(np.asarray(obs.visible)[:, 0]):
+        camera = rig.camera(int(j))
+        K, k = np.asarray(camera.K), np.asarray(camera.distortion)
+        T_camera_vehicle = matrix(rig.Ts_camera_vehicle.wxyz_xyz[j])
+        T_camera_world = T_camera_vehicle @ np.linalg.inv(T_world_vehicle)
+        for corner, pixel in zip(corners, np.asarray(obs.corners_px)[j, 0], strict=True):
+            point = (T_camera_world @ np.append(corner, 1))[:3]
+            residuals.append((paper.project(K, "equidistant", k, point) - pixel) / sigma_px)
+    return np.ravel(residuals)
+
+
+def derivative(function, x, h=1e-5) -> np.ndarray:
+    """Of a vector by a vector, by central differences."""
+    columns = [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))]
+    return np.stack(columns, axis=1)

@@ -21,11 +21,17 @@ def make_setup() -> DriveSetup:
     return DriveSetup(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar(), ROUTE, float64=True)
 
 
-def simulated(setup: DriveSetup, duration_s: float, **how) -> list[Step]:
-    """A drive in lockstep; see there."""
+def simulated(
+    setup: DriveSetup, duration_s: float, folder: Path | None = None, **how
+) -> list[Step]:
+    """A drive in lockstep; see there.
+
+    Args:
+        folder: of executables, see `DriveSetup.pilot`.
+    """
     start = setup.route_on_map.start_pose
     world = SimWorld(setup.rig, setup.markers, setup.vehicle, start, BEGIN_NS)
-    return list(drive(setup.pilot(None), world, duration_s, **how))
+    return list(drive(setup.pilot(folder), world, duration_s, **how))
 
 
 def record(path: Path, header: dict[str, Any], told: Iterable[tuple[Input, Outcome]]) -> None:

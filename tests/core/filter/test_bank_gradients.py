@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.models.geometry import T_world_vehicle_from_planar
 from jaxnav.core.navigator import Navigator
 from tests import worlds
+from tests.helpers.filters import sense
 from tests.reference import paper
 
 DRIVES, FRAMES, PERIOD_S = 4, 8, 1 / 15
@@ -36,17 +36,10 @@ def seen():
     poses = np.stack([paper.drive(start, *args)[:-1:20] for start in starts])
     noise_px = rng.standard_normal((DRIVES, FRAMES, 1, 1, 4, 2))
 
-    @jax.vmap
-    @jax.vmap
-    def look(pose, noise_px, dt_s):
-        obs = worlds.observe(RIG, MARKERS, T_world_vehicle_from_planar(pose), noise_px)
-        told = jnp.asarray(SPEED_MPS), jnp.asarray(STEERING_RAD), dt_s
-        return eqx.tree_at(
-            lambda o: (o.speed_mps, o.steering_rad, o.dt_s), obs, told, is_leaf=lambda x: x is None
-        )
-
-    dt_s = jnp.full((DRIVES, FRAMES), PERIOD_S).at[:, 0].set(0)
-    return look(jnp.asarray(poses), jnp.asarray(noise_px), dt_s)
+    dt_s = np.full((DRIVES, FRAMES), PERIOD_S)
+    dt_s[:, 0] = 0
+    told = (jnp.asarray(x) for x in (poses, noise_px))
+    return sense(RIG, MARKERS, *told, SPEED_MPS, STEERING_RAD, dt_s)
 
 
 def reported(logs, obs):

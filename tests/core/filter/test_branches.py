@@ -21,8 +21,10 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.core.pose.observation import Observation
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
-from tests.core.filter.test_hypotheses import EYE, PLANAR, derivative, matrix, view, whitened_pixels
-from tests.reference.rigid import cayley, inverse_cayley
+from tests.core.filter.test_hypotheses import EYE, PLANAR, matrix, view
+from tests.helpers.filters import derivative, whitened_pixels
+from tests.reference.rigid import cayley, inverse_cayley, wxyz_xyz
+from tests.reference.rigid import matrix as matrix_of
 
 POSE = worlds.OVERLAP_VIEW
 SIGMA = {3: np.array([0.06, 0.05, 0.07]), 6: np.array([0.06, 0.05, 0.04, 0.05, 0.07, 0.06])}
@@ -99,15 +101,15 @@ def test_a_branch_about_the_minimum_is_the_minimum():
 
 def candidates(turns_rad, costs, valid) -> Candidates:
     """Candidates turned about the vertical from `POSE`, known to 2 degrees and 2 cm."""
-    Ts = [(worlds.planar(POSE[0], POSE[1], POSE[2] + turn)).inverse().wxyz_xyz
-          for turn in turns_rad]  # fmt: skip
-    C = jnp.diag(jnp.asarray([0.02**2] * 3 + [0.035**2] * 3))
+    poses = [worlds.planar(POSE[0], POSE[1], POSE[2] + turn).wxyz_xyz for turn in turns_rad]
+    Ts = wxyz_xyz(np.linalg.inv(matrix_of(np.stack(poses))))
+    C = np.diag([0.02**2] * 3 + [0.035**2] * 3)
     empty = Candidates.none(len(turns_rad), jnp.result_type(float))
     return dataclasses.replace(
         empty,
-        T_vehicle_world=jaxlie.SE3(jnp.stack(Ts)),
+        T_vehicle_world=jaxlie.SE3(jnp.asarray(Ts)),
         cost=jnp.asarray(costs, float),
-        covariance=jnp.tile(C, (len(turns_rad), 1, 1)),
+        covariance=jnp.asarray(np.tile(C, (len(turns_rad), 1, 1))),
         valid=jnp.asarray(valid),
     )
 
@@ -115,25 +117,26 @@ def candidates(turns_rad, costs, valid) -> Candidates:
 wanted_of = jax.jit(lambda prior, seen: second_poses(prior, 0, seen, -20.0))
 
 
-@pytest.mark.parametrize(
-    ("turns_deg", "costs", "valid", "wanted"),
-    [
-        ((2.0, 12.0, 14.0), (1, 2, 3), (True, True, True), (False, True, True)),
-        ((12.0, 2.0, 14.0), (1, 2, 60), (True, True, True), (True, False, False)),  # misfits
-        ((2.0, 120.0, 9.0), (1, 2, 1), (True, True, True), (False, False, True)),  # too far
-        ((2.0, 12.0, 9.0), (1, 2, 1), (True, False, True), (False, False, True)),  # no candidate
-        ((2.0, 12.0, 9.0), (1, 2, 1), (False, False, False), (False, False, False)),
-        ((12.0, 60.0, 9.0), (1, 99, 99), (True, True, True), (True, False, False)),  # the best one
-    ],
-)
-def test_the_candidates_wanted_are_probable_and_not_the_nearest(turns_deg, costs, valid, wanted):
+WANTED = [
+    # turns_deg, costs, valid, wanted
+    ((2.0, 12.0, 14.0), (1, 2, 3), (True, True, True), (False, True, True)),
+    ((12.0, 2.0, 14.0), (1, 2, 60), (True, True, True), (True, False, False)),  # misfits
+    ((2.0, 120.0, 9.0), (1, 2, 1), (True, True, True), (False, False, True)),  # too far
+    ((2.0, 12.0, 9.0), (1, 2, 1), (True, False, True), (False, False, True)),  # no candidate
+    ((2.0, 12.0, 9.0), (1, 2, 1), (False, False, False), (False, False, False)),
+    ((12.0, 60.0, 9.0), (1, 99, 99), (True, True, True), (True, False, False)),  # the best one
+]
+
+
+def test_the_candidates_wanted_are_probable_and_not_the_nearest():
     prior = prediction(PLANAR)
-    second = wanted_of(prior, candidates(np.deg2rad(turns_deg), costs, valid))
-    assert tuple(np.asarray(second.wanted)) == wanted
-    for n in np.flatnonzero(wanted):
-        # A turn at the vehicle's own place: cay's half tangent, and no shift.
-        expected = [0, 0, 2 * np.tan(np.deg2rad(turns_deg[n]) / 2)]
-        np.testing.assert_allclose(second.xi[n], expected, atol=1e-9)
+    for turns_deg, costs, valid, wanted in WANTED:
+        second = wanted_of(prior, candidates(np.deg2rad(turns_deg), costs, valid))
+        assert tuple(np.asarray(second.wanted)) == wanted, (turns_deg, costs, valid)
+        for n in np.flatnonzero(wanted):
+            # A turn at the vehicle's own place: cay's half tangent, and no shift.
+            expected = [0, 0, 2 * np.tan(np.deg2rad(turns_deg[n]) / 2)]
+            np.testing.assert_allclose(second.xi[n], expected, atol=1e-9)
 
 
 def test_a_bank_that_has_seen_nothing_has_no_second_pose():
@@ -146,8 +149,7 @@ given_slots = jax.jit(give_slots)
 
 
 @given(
-    st.lists(st.booleans(), min_size=4, max_size=4),
-    st.lists(st.booleans(), min_size=6, max_size=6),
+    st.lists(st.booleans(), min_size=4, max_size=4), st.lists(st.booleans(), min_size=6, max_size=6)
 )
 def test_every_second_pose_gets_an_empty_slot_of_its_own(wanted, empty):
     xi = np.arange(1, 13, dtype=float).reshape(4, 3)

@@ -1,6 +1,6 @@
 """A free body's odometry that is off in scale and direction: derivatives, drives, and banks."""
 
-import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from jaxnav.core.models.vehicle import OdometryErrors, default_odometry_sigma
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives
+from tests.helpers.filters import believing
 
 ARM_M = np.array([0.1, -0.05, 0.2])
 ERRORS = OdometryErrors.create(default_odometry_sigma(), ARM_M)
@@ -52,11 +53,12 @@ def told_by(errors, twist):
 def test_a_twist_is_corrected_as_the_step_of_the_odometry_s_body_is():
     rng = np.random.default_rng(1)
     errors, twist = jnp.asarray(0.1 * rng.normal(size=4)), jnp.asarray(rng.normal(size=6))
-    found = ERRORS.corrected(told_by(errors, twist), errors)
+    found = jax.jit(lambda u, e: ERRORS.corrected(told_by(e, u), e))(twist, errors)
     np.testing.assert_allclose(found, twist, atol=1e-12)
-    for turns in (np.zeros(3), rng.normal(size=3)):
-        check_derivatives(ERRORS.corrected, jnp.asarray([*rng.normal(size=3), *turns]), errors)
-        check_derivatives(ERRORS.corrected, jnp.asarray([*rng.normal(size=3), *turns]), 0 * errors)
+    # With and without a turn, with and without errors.
+    twists = rng.normal(size=(4, 6)) * np.repeat([[1, 1, 1, 0, 0, 0], [1] * 6], 2, axis=0)
+    several = jnp.asarray(np.outer([1, 0, 1, 0], errors))
+    check_derivatives(jax.vmap(ERRORS.corrected), jnp.asarray(twists), several)
 
 
 @pytest.mark.parametrize("told", [True, False], ids=["told", "silent"])
@@ -141,24 +143,38 @@ def drive(motion, errors, key, states: int):
 def judged(motion, errors):
     """Over many drives, (STEPS,): NEES of the pose over its 6 dof, and position errors in m."""
     states = 6 + motion.at_first()[0].shape[0]
-    run = jax.jit(jax.vmap(lambda errors, key: drive(motion, errors, key, states)))
-    truth, *both = run(errors, jax.random.split(jax.random.key(3), DRIVES))
+    both, bias, P_bias = jax.device_get(many_drives(motion, errors, KEYS, states))
     scores = []
-    for mean, P in both:
-        error = jax.vmap(
-            jax.vmap(lambda a, b: inverse_cayley(jaxlie.SE3(b).inverse() @ jaxlie.SE3(a)))
-        )(truth, mean[..., :7])
-        whitened = np.linalg.solve(np.linalg.cholesky(P[..., :6, :6]), error[..., None])
-        nees = np.mean(np.sum(whitened[..., 0] ** 2, axis=-1), axis=0) / 6
-        scores.append((nees, np.sqrt(np.mean(np.sum(error[..., :3] ** 2, axis=-1), axis=0))))
-    return scores, both[0][0][:, -1, 13:], both[0][1][:, -1, 12:, 12:]
+    for off, P in both:
+        nees = np.sum(off * np.linalg.solve(P, off[..., None])[..., 0], axis=-1)
+        rms_m = np.sqrt(np.mean(np.sum(off[..., :3] ** 2, axis=-1), axis=0))
+        scores.append((np.mean(nees, axis=0) / 6, rms_m))
+    return scores, bias, P_bias
+
+
+KEYS = jax.random.split(jax.random.key(3), DRIVES)
+
+
+@functools.partial(jax.jit, static_argnames="states")
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, None))
+def many_drives(motion, errors, key, states):
+    """Of the filter and the smoother: errors of poses, and their covariances; the odometry's errors
+    as they are found at the end."""
+    truth, *both = drive(motion, errors, key, states)
+
+    def off(one, found, P):
+        return inverse_cayley(jaxlie.SE3(found[:7]).inverse() @ jaxlie.SE3(one)), P[:6, :6]
+
+    mean, P = both[0]
+    told = [jax.vmap(off)(truth, *moments) for moments in both]
+    return told, mean[-1, 13:], P[-1, 12:, 12:]
 
 
 @pytest.fixture(scope="module")
 def off_by_7_percent_and_2_degrees():
     """Every drive the same: 0.93 of the way, and the body turned by 2 degrees."""
-    errors = jnp.asarray([1 / 0.93 - 1, 0, 0, np.deg2rad(2.0)])
-    return errors, jnp.broadcast_to(errors, (DRIVES, 4))
+    errors = np.array([1 / 0.93 - 1, 0, 0, np.deg2rad(2.0)])
+    return errors, jnp.asarray(np.tile(errors, (DRIVES, 1)))
 
 
 def test_errors_that_are_as_large_as_told_leave_poses_as_far_off_as_they_say():
@@ -198,15 +214,16 @@ def test_a_bank_keeps_what_it_has_learnt_where_it_merges_and_begins_anew_at_the_
     bank = MOTION.init(2)
     rest, P_rest = MOTION.at_first()
     np.testing.assert_array_equal(bank.mean[0, 7:], rest)
-    errors = jnp.asarray([[0.02, 0.01, 0.0, 0.03], [0.04, 0.01, 0.02, -0.01]])
-    bank = dataclasses.replace(
-        bank,
-        mean=bank.mean.at[:, 13:].set(errors),
-        covariance=1e-6 * bank.covariance,
-        initialised=jnp.ones(2, bool),
-        log_weight=jnp.log(jnp.asarray([0.75, 0.25])),
-    )
-    merged = merge_hypotheses(bank, jnp.asarray([0, 0]), MOTION.difference, MOTION.moved)
+    errors = np.array([[0.02, 0.01, 0.0, 0.03], [0.04, 0.01, 0.02, -0.01]])
+    mean, P = np.array(bank.mean), 1e-6 * np.asarray(bank.covariance)
+    mean[:, 13:] = errors
+    bank = believing(MOTION, mean, P, [0.75, 0.25])
+
+    @jax.jit
+    def merged_in_one(bank):
+        return merge_hypotheses(bank, jnp.asarray([0, 0]), MOTION.difference, MOTION.moved)
+
+    merged = merged_in_one(bank)
     np.testing.assert_array_equal(merged.initialised, [True, False])
     np.testing.assert_allclose(merged.mean[0, 13:], 0.75 * errors[0] + 0.25 * errors[1], atol=1e-12)
     spread = (errors[0] - errors[1]) * np.sqrt(0.75 * 0.25)
@@ -215,8 +232,14 @@ def test_a_bank_keeps_what_it_has_learnt_where_it_merges_and_begins_anew_at_the_
         np.outer(spread, spread) + np.asarray(bank.covariance[0, 12:, 12:]),
         atol=1e-12,
     )
-    seen = MeasuredPose(jaxlie.SE3.identity(), 1e-4 * jnp.eye(6), jnp.zeros(()), jnp.asarray(True))
-    mean, P = MOTION.start(jax.tree.map(lambda leaf: leaf[0], bank), seen, reading(jnp.zeros(6)))
+
+    @jax.jit
+    def begun(bank):
+        here = jaxlie.SE3.identity(), 1e-4 * jnp.eye(6), jnp.zeros(()), jnp.asarray(True)
+        first = jax.tree.map(lambda leaf: leaf[0], bank)
+        return MOTION.start(first, MeasuredPose(*here), reading(jnp.zeros(6)))
+
+    mean, P = begun(bank)
     np.testing.assert_array_equal(mean[13:], 0)
     np.testing.assert_array_equal(P[6:, 6:], P_rest)
 

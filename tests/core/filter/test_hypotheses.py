@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -25,10 +27,20 @@ from jaxnav.core.pose.observation import Observation, Snapshot
 from jaxnav.core.pose.refine import Candidates
 from tests import worlds
 from tests.derivatives import in_float32
-from tests.helpers.compiling import jit_to_run
-from tests.helpers.filters import believing, find, select
+from tests.helpers.filters import (
+    believing,
+    derivative,
+    find,
+    select,
+    sense,
+    snap,
+    step,
+    whitened_pixels,
+)
+from tests.helpers.simulated import make_setup
 from tests.reference import kalman, paper
-from tests.reference.rigid import cayley, inverse_cayley
+from tests.reference.rigid import cayley, inverse_cayley, twist_matrix, wxyz_xyz
+from tests.reference.rigid import matrix as matrix_of
 
 WHEELBASE_M = 0.256
 EYE = np.eye(6)
@@ -52,16 +64,11 @@ def view(pose, sigma_px: float = 0.3, seed: int = 0) -> Snapshot:
     rig, markers = worlds.qcar_rig(), worlds.paper_markers()
     noise = sigma_px * np.random.default_rng(seed).standard_normal((4, 1, 4, 2))
     obs = worlds.observe(rig, markers, worlds.planar(*pose), jnp.asarray(noise))
-    return Snapshot.create(rig, markers, obs, sigma_px)
+    return snap(rig, markers, obs, sigma_px)
 
 
 def matrix(T: jaxlie.SE3) -> np.ndarray:
-    return np.asarray(T.as_matrix())
-
-
-def derivative(function, x, h=1e-5) -> np.ndarray:
-    columns = [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))]
-    return np.stack(columns, axis=1)
+    return matrix_of(T.wxyz_xyz)
 
 
 def priors(pose, freedom=PLANAR, nuisance=None, count=8, scale=1.0, seed=1) -> PoseBelief:
@@ -72,32 +79,17 @@ def priors(pose, freedom=PLANAR, nuisance=None, count=8, scale=1.0, seed=1) -> P
     roots = [np.diag(sigma * rng.uniform(0.7, 1.5, d)) @ (np.eye(d) + 0.3 * rng.normal(size=(d, d)))
              for _ in range(count)]  # fmt: skip
     off = [0.7 * freedom @ (sigma * rng.normal(size=d)) for _ in range(count)]
-    Ts = [worlds.planar(*pose) @ jaxlie.SE3.exp(jnp.asarray(xi)) for xi in off]
+    here = matrix(worlds.planar(*pose))
+    Ts = np.stack([here @ scipy.linalg.expm(twist_matrix(xi)) for xi in off])
     return PoseBelief(
-        T_world_vehicle=jaxlie.SE3(jnp.stack([T.wxyz_xyz for T in Ts])),
-        covariance=jnp.stack([jnp.asarray(freedom @ L @ L.T @ freedom.T) for L in roots]),
-        log_weight=jnp.full(count, -np.log(count)),
-        initialised=jnp.ones(count, bool),
+        T_world_vehicle=jaxlie.SE3(jnp.asarray(wxyz_xyz(Ts))),
+        covariance=jnp.asarray([freedom @ L @ L.T @ freedom.T for L in roots]),
+        log_weight=jnp.asarray(np.full(count, -np.log(count))),
+        initialised=jnp.asarray(np.ones(count, bool)),
         freedom=jnp.asarray(freedom),
-        nuisance=jnp.zeros((6, 0)) if nuisance is None else jnp.asarray(nuisance),
+        nuisance=jnp.asarray(np.zeros((6, 0)) if nuisance is None else nuisance),
         gate_nis=jnp.inf,
     )
-
-
-def whitened_pixels(snapshot: Snapshot, T_world_vehicle: np.ndarray) -> np.ndarray:
-    """Projected less observed corners over sigma, in loops over the paper's equations."""
-    rig, obs = snapshot.rig, snapshot.obs
-    corners = np.asarray(snapshot.markers.corners_world_m)[0]
-    sigma_px = float(snapshot.seen.sigma_px[0, 0])
-    residuals = []
-    for j in np.flatnonzero(np.asarray(obs.visible)[:, 0]):
-        camera = rig.camera(int(j))
-        K, k = np.asarray(camera.K), np.asarray(camera.distortion)
-        T_camera_world = matrix(rig.Ts_camera_vehicle)[j] @ np.linalg.inv(T_world_vehicle)
-        for corner, pixel in zip(corners, np.asarray(obs.corners_px)[j, 0], strict=True):
-            point = (T_camera_world @ np.append(corner, 1))[:3]
-            residuals.append((paper.project(K, "equidistant", k, point) - pixel) / sigma_px)
-    return np.ravel(residuals)
 
 
 NEAR = worlds.OVERLAP_VIEW  # two cameras see the marker: well conditioned
@@ -160,20 +152,23 @@ def correlations(covariance, freedom) -> np.ndarray:
     return P / (sigma[:, :, None] * sigma[:, None])
 
 
-@jit_to_run
+@jax.jit
 def covariances_of(here, prior, snapshot, floors):
     fits = fit_poses(jaxlie.SE3(here), prior.covariance, None, prior, snapshot, floors, 20)
     return fits.posterior.covariance
 
 
-@pytest.mark.parametrize("freedom", [PLANAR, EYE], ids=["car", "free"])
+@pytest.mark.parametrize(
+    "freedom",
+    [pytest.param(PLANAR, id="car"), pytest.param(EYE, id="free", marks=pytest.mark.long)],
+)
 def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(freedom):
     """A drive's first frames: nothing known to a metre, corners known to a fiftieth of a pixel."""
     snapshot, prior = view(NEAR, 0.02), priors(NEAR, freedom, scale=20.0)
     here = jnp.tile(worlds.planar(*NEAR).wxyz_xyz, (8, 1))
     narrow = {np.float64: np.float32, np.int64: np.int32}
     for floor in (0.0, 1e-4):
-        told = here, prior, snapshot, jnp.full(6, floor)
+        told = here, prior, snapshot, jnp.full(6, floor, float)
         exact = correlations(covariances_of(*told), freedom)
         with jax.enable_x64(False):
             rounded = jax.tree.map(
@@ -185,32 +180,31 @@ def test_float32_keeps_what_corners_say_that_are_far_surer_than_the_prediction(f
         assert np.all(np.linalg.eigvalsh(found) > 0)
 
 
-@pytest.mark.parametrize("most", [1.0, 1.5, 1e9])
-def test_corners_that_contradict_all_predictions_are_trusted_less_and_so_are_these(most):
+def test_corners_that_contradict_all_predictions_are_trusted_less_and_so_are_these():
     """As if all variances were larger by the least NIS over three sigmas of chi-square."""
-    snapshot = view(NEAR)
+    snapshot, lane = view(NEAR), 3
     prior = priors(NEAR + np.array([0.02, -0.015, 0.01]), scale=0.05)
-    selector = eqx.tree_at(lambda s: s.max_inflation, EXACT, most)
-    measured = select(selector, prior, find(snapshot), snapshot).measured
-    nis = np.sum(np.asarray(measured.innovation) ** 2, axis=1)
-    excess = np.min(nis) / (3 + 3 * np.sqrt(6))
-    assert excess > 1.8
-    np.testing.assert_allclose(measured.inflation, min(excess, most), rtol=1e-6)
-    for lane in (0, 3):
-        T_prior = matrix(prior.T_world_vehicle)[lane]
-        P = PLANAR.T @ np.asarray(prior.covariance)[lane] @ PLANAR
-        u, J, _ = textbook_fit(T_prior, P, PLANAR, snapshot)
+    T_prior = matrix(prior.T_world_vehicle)[lane]
+    P = PLANAR.T @ np.asarray(prior.covariance)[lane] @ PLANAR
+    u, J, _ = textbook_fit(T_prior, P, PLANAR, snapshot)
+    T_expected = T_prior @ cayley(PLANAR @ u)
+    for most in (1.0, 1.5, 1e9):
+        selector = eqx.tree_at(lambda s: s.max_inflation, EXACT, most)
+        measured = select(selector, prior, find(snapshot), snapshot).measured
+        nis = np.sum(np.asarray(measured.innovation) ** 2, axis=1)
+        excess = np.min(nis) / (3 + 3 * np.sqrt(6))
+        assert excess > 1.8
+        np.testing.assert_allclose(measured.inflation, min(excess, most), rtol=1e-6)
         expected = min(excess, most) * np.linalg.inv(J.T @ J + np.linalg.inv(P))
-        T = matrix(measured.T_world_vehicle)[lane]
-        away = PLANAR.T @ inverse_cayley(np.linalg.inv(T_prior @ cayley(PLANAR @ u)) @ T)
-        covariance = PLANAR.T @ np.asarray(measured.covariance)[lane] @ PLANAR
         sigma = np.sqrt(np.diagonal(expected))
+        T = matrix(measured.T_world_vehicle)[lane]
+        away = PLANAR.T @ inverse_cayley(np.linalg.inv(T_expected) @ T)
         np.testing.assert_allclose(away / sigma, 0, atol=0.02)
-        np.testing.assert_allclose(covariance / np.outer(sigma, sigma),
-                                   expected / np.outer(sigma, sigma), atol=0.03)  # fmt: skip
+        gap = PLANAR.T @ np.asarray(measured.covariance)[lane] @ PLANAR - expected
+        np.testing.assert_allclose(gap / np.outer(sigma, sigma), 0, atol=0.03)
 
 
-@pytest.mark.parametrize("tilt_sigma", [0.005, 0.02])
+@pytest.mark.parametrize("tilt_sigma", [0.005, pytest.param(0.02, marks=pytest.mark.long)])
 def test_a_nuisance_is_an_unknown_with_that_prior(tilt_sigma):
     """Height, roll and pitch: six unknowns by SciPy, of which three are looked at."""
     pose, lane = worlds.FRONT_VIEW, 1
@@ -298,6 +292,10 @@ def viewing_directions(Ts_world_vehicle: np.ndarray, snapshot: Snapshot) -> np.n
     return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
+grounded = jax.jit(on_ground)
+fan_of = jax.jit(fan, static_argnames="hypotheses")
+
+
 @pytest.mark.parametrize("pose", [worlds.START_VIEW, (0.0, -0.4, np.pi / 2), NEAR])
 @pytest.mark.parametrize("kind", ["car", "free"])
 def test_the_fan_covers_all_viewing_angles(kind, pose):
@@ -307,7 +305,7 @@ def test_the_fan_covers_all_viewing_angles(kind, pose):
     bank = MultiHypothesis(hypotheses=24 if kind == "car" else 60)
     freedom = PLANAR if kind == "car" else EYE
     prior = priors(pose, freedom=freedom, count=bank.hypotheses)
-    start = fan(prior, candidates, snapshot, bank.hypotheses)
+    start = fan_of(prior, candidates, snapshot, bank.hypotheses)
     assert start.initialised.shape == (bank.hypotheses,)
     assert np.sum(np.exp(start.log_weight)) == pytest.approx(1)
     Ts = matrix(start.T_world_vehicle)
@@ -329,17 +327,18 @@ def test_the_fan_covers_all_viewing_angles(kind, pose):
         gaps_deg = np.rad2deg(np.arccos(np.clip(wanted @ directions.T, -1, 1))).min(axis=1)
         assert gaps_deg.max() < 20
         centers = np.linalg.inv(members)[:, :3] @ np.append(
-            np.asarray(snapshot.markers.Ts_world_marker.translation())[0], 1
+            np.asarray(snapshot.markers.Ts_world_marker.wxyz_xyz)[0, 4:], 1
         )
         np.testing.assert_allclose(centers, np.broadcast_to(centers[:1], centers.shape), atol=1e-9)
     # The truth and every candidate, as an upright marker's mirror image is one, are near a member
     # by its own covariance.
-    wanted = [worlds.planar(*pose)] + [
-        jaxlie.SE3(T).inverse() for T in candidates.T_vehicle_world.wxyz_xyz[candidates.valid]
-    ]
+    valid = np.asarray(candidates.valid)
+    Ts = np.linalg.inv(matrix(candidates.T_vehicle_world)[valid])
+    wanted = np.concatenate([matrix(worlds.planar(*pose))[None], Ts])
+    if kind == "car":
+        wanted = np.stack([matrix(grounded(jaxlie.SE3(jnp.asarray(wxyz_xyz(T))))) for T in wanted])
     for T in wanted:
-        T = on_ground(T) if kind == "car" else T
-        xi = np.stack([inverse_cayley(np.linalg.inv(member) @ matrix(T)) for member in members])
+        xi = np.stack([inverse_cayley(np.linalg.inv(member) @ T) for member in members])
         P = freedom.T @ np.asarray(start.covariance)[: len(members)] @ freedom
         distances = [
             x @ freedom @ np.linalg.solve(C, freedom.T @ x) for x, C in zip(xi, P, strict=True)
@@ -363,7 +362,11 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
     belief = believing(motion, means, covariances, weights)
     belief = dataclasses.replace(belief, initialised=jnp.asarray(alive))
 
-    after = merge_hypotheses(belief, jnp.asarray(merged_into), motion.difference, motion.moved)
+    @jax.jit
+    def merged(bank, into):
+        return merge_hypotheses(bank, into, motion.difference, motion.moved)
+
+    after = merged(belief, jnp.asarray(merged_into))
     assert after.initialised.tolist() == [True, False, True, False, False, False]
     for receiver in (0, 2):
         who = np.flatnonzero((merged_into == receiver) & alive)
@@ -379,7 +382,7 @@ def test_merging_keeps_the_mixture_s_mean_and_covariance():
         np.testing.assert_allclose(error, 0, atol=1e-12)
         np.testing.assert_allclose(after.covariance[receiver], covariance, atol=1e-12)
         assert np.exp(after.log_weight[receiver]) == pytest.approx(weights[who].sum())
-    alone = merge_hypotheses(belief, jnp.arange(count), motion.difference, motion.moved)
+    alone = merged(belief, jnp.arange(count))
     for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(belief), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-15)
 
@@ -391,18 +394,20 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
     motion = BicycleKalman(worlds.qcar()) if kind == "car" else ConstantVelocity()
     rng = np.random.default_rng(5)
     shifts = 0.15 * rng.normal(size=(4, size))
-    start = motion.init(4)
-    seam = start.mean.at[:, 2].add(3.1 if kind == "car" else 0.0)
-    means = jax.vmap(motion.moved)(seam, jnp.asarray(shifts))
+    moved = jax.jit(jax.vmap(motion.moved))
+    seam = np.array(motion.init(4).mean)
+    seam[:, 2] += 3.1 if kind == "car" else 0.0
+    means = np.asarray(moved(jnp.asarray(seam), jnp.asarray(shifts)))
     roots = 0.02 * rng.normal(size=(4, size, size)) + 0.03 * np.eye(size)
     share = np.array([0.5, 0.3, 0.2, 0.9])
     belief = believing(motion, means, roots @ np.swapaxes(roots, 1, 2), share)
-    belief = dataclasses.replace(belief, initialised=jnp.arange(4) < 3)
+    belief = dataclasses.replace(belief, initialised=jnp.asarray([True, True, True, False]))
     drawn = rng.choice(3, size=20_000, p=share[:3])
     errors = np.einsum("sde,se->sd", roots[drawn], rng.normal(size=(len(drawn), size)))
-    truths = jax.vmap(motion.moved)(means[drawn], jnp.asarray(errors))
-    away = np.asarray(jax.vmap(lambda truth: motion.difference(truth, means[0]))(truths))
-    covariance = np.asarray(motion.error_covariance(belief, jnp.asarray(0)))
+    truths = moved(means[drawn], jnp.asarray(errors))
+    away = np.asarray(jax.jit(jax.vmap(motion.difference, (0, None)))(truths, means[0]))
+    error_covariance = eqx.filter_jit(motion.error_covariance)
+    covariance = np.asarray(error_covariance(belief, jnp.asarray(0)))
     nees = np.einsum("sd,sd->s", away, np.linalg.solve(covariance, away.T).T)
     assert nees.mean() == pytest.approx(size, rel=0.03)
     own = np.einsum("sd,sd->s", away, np.linalg.solve(belief.covariance[0], away.T).T)
@@ -410,7 +415,7 @@ def test_the_reported_covariance_is_that_of_the_error(kind, size):
     # Nobody there, and nobody else.
     for nobody in (motion.init(4), motion.init(1)):
         np.testing.assert_array_equal(
-            motion.error_covariance(nobody, jnp.asarray(0)), nobody.covariance[0]
+            error_covariance(nobody, jnp.asarray(0)), nobody.covariance[0]
         )
 
 
@@ -439,51 +444,48 @@ def car() -> Navigator:
 def _car(precision: str) -> Navigator:
     """Made once in each precision."""
     del precision
-    return Navigator(worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar())
+    return make_setup().navigator()
 
 
-@jit_to_run
-@functools.partial(jax.vmap, in_axes=(None, 0))
-def run(nav: Navigator, obs: Observation) -> Seen:
-    def step(state, obs):
-        state, out = nav.step(state, obs)
-        belief = state.belief.bank
-        return state, Seen(
-            pose=out.pose,
-            hypothesis=out.hypothesis,
-            decided=out.decided,
-            flip_probability=out.flip_probability,
-            nis=out.nis,
-            hypotheses=jnp.sum(belief.initialised),
-            rejections=jnp.max(jnp.where(belief.initialised, belief.rejections.count, 0)),
-            started=out.located,
-        )
-
-    return jax.lax.scan(step, nav.init(), obs)[1]
+def run(nav: Navigator, obs: Observation, seeds: Sequence[int] = range(SEEDS)) -> Seen:
+    """Of some of the drives."""
+    seen, state = [], None
+    for seed, frame in itertools.product(seeds, range(FRAMES)):
+        state = state if frame else nav.init()
+        given = jax.tree.map(lambda leaf, at=(seed, frame): leaf[at], obs)
+        state, out = step(nav, state, given)
+        bank = state.belief.bank
+        told = (
+            out.pose, out.hypothesis, out.decided, out.flip_probability, out.nis, bank.initialised,
+            bank.rejections.count, out.located,
+        )  # fmt: skip
+        seen.append(Seen(*jax.device_get(told)))
+    shape = len(seeds), FRAMES
+    seen = jax.tree.map(lambda *x: np.stack(x).reshape(*shape, *x[0].shape), *seen)
+    return dataclasses.replace(
+        seen,
+        hypotheses=np.sum(seen.hypotheses, axis=2),
+        rejections=np.max(np.where(seen.hypotheses, seen.rejections, 0), axis=2),
+    )
 
 
 def sensed(poses, speed_mps, steering_rad=0.0, sigma_px=1.0, seed=0) -> Observation:
     """(SEEDS, FRAMES) readings along true poses (FRAMES, 3)."""
     rng = np.random.default_rng(seed)
     shape = (SEEDS, FRAMES)
-    return look(
+    obs = sense(
         car().rig,
         car().markers,
         jnp.asarray(np.broadcast_to(poses, (*shape, 3))),
         jnp.asarray(sigma_px * rng.standard_normal((*shape, 4, 1, 4, 2))),
         jnp.asarray(speed_mps + 0.01 * rng.standard_normal(shape)),
         jnp.asarray(steering_rad + 0.005 * rng.standard_normal(shape)),
+        PERIOD_S,
     )
-
-
-@jax.jit
-def look(rig, markers, poses, noise, speed_mps, steering_rad) -> Observation:
-    def one(pose, noise, speed_mps, steering_rad):
-        T_world_vehicle = worlds.T_world_vehicle_from_planar(pose)
-        odometry = {"speed_mps": speed_mps, "steering_rad": steering_rad, "dt_s": PERIOD_S}
-        return worlds.observe(rig, markers, T_world_vehicle, noise, **odometry)
-
-    return jax.vmap(jax.vmap(one))(poses, noise, speed_mps, steering_rad)
+    sigmas_px = np.full((*shape, 4, 1, 4), float(sigma_px))
+    return eqx.tree_at(
+        lambda o: o.corner_sigma_px, jax.device_get(obs), sigmas_px, is_leaf=lambda x: x is None
+    )
 
 
 def arc(start, speed_mps, steering_rad, frames=FRAMES) -> np.ndarray:
@@ -506,35 +508,26 @@ PARKED = (0.8, 1.47 - AHEAD_M, np.deg2rad(100.0))
 
 
 def parked(sigma_px: float) -> Seen:
-    nav = eqx.tree_at(lambda n: n.corner_sigma_px, car(), jnp.asarray(sigma_px, float))
-    poses = np.broadcast_to(PARKED, (FRAMES, 3))
-    return run(nav, sensed(poses, 0.0, sigma_px=sigma_px))
-
-
-@pytest.mark.long
-def test_a_parked_car_far_away_does_not_know_at_first_and_says_so():
-    """One look does not tell the poses apart. Many, of independent noise, may in the end."""
-    seen = parked(1.0)
-    assert np.all(seen.started)
-    assert not np.any(seen.decided[:, 0])
-    assert np.mean(seen.flip_probability[:, 0]) > 0.2
-    assert np.all(seen.hypotheses[:, 0] > 1)
-    _, heading_rad = errors_of(seen, np.asarray(PARKED))
-    wrong = heading_rad > np.deg2rad(20)
-    assert np.mean(wrong[:, 0]) > 0.2
-    # Where it has come to know it is right.
-    sure = np.asarray(seen.decided)
-    assert np.mean(wrong[sure]) < 0.01
+    return run(car(), sensed(np.broadcast_to(PARKED, (FRAMES, 3)), 0.0, sigma_px=sigma_px))
 
 
 @pytest.mark.long
 def test_a_parked_car_whose_image_says_nothing_stays_undecided():
-    """Corners that are four times worse: the five seconds are over before it could know."""
-    seen = parked(4.0)
+    """One look does not tell the poses apart. Many, of independent noise, may in the end; of
+    corners that are four times worse, the five seconds are over before it could know."""
+    seen, worse = parked(1.0), parked(4.0)
     assert np.all(seen.started)
-    assert not np.any(seen.decided)
-    assert np.all(seen.hypotheses > 1)
-    assert np.mean(seen.flip_probability) > 0.1
+    assert not np.any(seen.decided[:, 0])
+    assert np.mean(seen.flip_probability[:, 0]) > 0.2
+    assert np.all(seen.hypotheses[:, 0] > 1)
+    wrong = errors_of(seen, np.asarray(PARKED))[1] > np.deg2rad(20)
+    assert np.mean(wrong[:, 0]) > 0.2
+    # Where it has come to know it is right.
+    assert np.mean(wrong[np.asarray(seen.decided)]) < 0.01
+    assert np.all(worse.started)
+    assert not np.any(worse.decided)
+    assert np.all(worse.hypotheses > 1)
+    assert np.mean(worse.flip_probability) > 0.1
 
 
 def test_a_short_drive_across_decides_for_the_truth():
@@ -564,56 +557,53 @@ def test_wheels_that_slip_choose_no_branch(seed):
     poses = arc((2.0, -1.0, np.deg2rad(125.0)), 0.5, -0.4)
     slipping = sensed(poses, 1.1 * 0.5, -0.4, seed=seed)
 
-    def wrong_once_decided(max_inflation: float) -> np.ndarray:
+    def wrong_once_decided(max_inflation: float, *seeds: int) -> np.ndarray:
         nav = eqx.tree_at(lambda n: n.selector.max_inflation, car(), max_inflation)
-        seen = run(nav, slipping)
+        seen = run(nav, slipping, seeds)
         assert np.all(np.any(seen.decided, axis=1))
         return (errors_of(seen, poses)[1] > np.deg2rad(20)) & np.asarray(seen.decided)
 
-    assert not np.any(wrong_once_decided(car().selector.max_inflation))
-    assert np.any(wrong_once_decided(1.0))
+    assert not np.any(wrong_once_decided(car().selector.max_inflation, *range(SEEDS)))
+    assert any(np.any(wrong_once_decided(1.0, seed)) for seed in range(SEEDS))
 
 
 def test_one_gross_outlier_changes_nothing():
-    """One frame in which another thing was taken for the marker, or its corners were mixed up."""
+    """One frame in which another thing was taken for the marker, or, in every other drive, its
+    corners were mixed up."""
     poses, frame = arc((1.2, 0.2, np.deg2rad(170.0)), 0.3, 0.0), 40
     obs = sensed(poses, 0.3)
-    clean = run(car(), obs)
+    clean = run(car(), obs, range(4))
     assert np.all(clean.decided[:, frame - 1 :])
     assert np.max(errors_of(clean, poses)[0][:, frame - 1 :]) < 0.05
-    moved = obs.corners_px.at[:, frame].add(jnp.asarray([60.0, -25.0]).reshape(1, 1, 1, 1, 2))
-    mixed_up = obs.corners_px.at[:, frame].set(jnp.roll(obs.corners_px[:, frame], 1, axis=3))
-    for corners_px in (moved, mixed_up):
-        spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, corners_px))
-        assert np.all(spoilt.nis[:, frame] > 100)
-        assert np.all(spoilt.rejections[:, frame] == 1)
-        assert np.all(spoilt.rejections[:, frame + 1] == 0)
-        assert np.all(spoilt.decided[:, frame:])
-        assert np.all(spoilt.flip_probability[:, frame] < 1e-6)
-        # Later two poses of the marker come close, and it is in doubt which one is nearer anyway.
-        more = np.asarray(spoilt.flip_probability) - np.asarray(clean.flip_probability)
-        assert np.max(more[:, frame:]) < 1e-3
-        gaps_m, gaps_rad = errors_of(spoilt, np.asarray(clean.pose))
-        assert np.max(gaps_m) < 0.01
-        assert np.max(gaps_rad) < np.deg2rad(0.5)
+    corners_px = obs.corners_px.copy()
+    corners_px[::2, frame] += [60.0, -25.0]
+    corners_px[1::2, frame] = np.roll(corners_px[1::2, frame], 1, axis=3)
+    spoilt = run(car(), eqx.tree_at(lambda o: o.corners_px, obs, corners_px), range(4))
+    assert np.all(spoilt.nis[:, frame] > 100)
+    assert np.all(spoilt.rejections[:, frame] == 1)
+    assert np.all(spoilt.rejections[:, frame + 1] == 0)
+    assert np.all(spoilt.decided[:, frame:])
+    assert np.all(spoilt.flip_probability[:, frame] < 1e-6)
+    # Later two poses of the marker come close, and it is in doubt which one is nearer anyway.
+    more = np.asarray(spoilt.flip_probability) - np.asarray(clean.flip_probability)
+    assert np.max(more[:, frame:]) < 1e-3
+    gaps_m, gaps_rad = errors_of(spoilt, np.asarray(clean.pose))
+    assert np.max(gaps_m) < 0.01
+    assert np.max(gaps_rad) < np.deg2rad(0.5)
 
 
 def test_the_reported_pose_s_own_tails_are_part_of_the_flip_probability():
     """One hypothesis alone, and nothing in view: what its heading's sigma says."""
     far_deg = 20.0
     snapshot = view(NEAR)
-    nothing = Snapshot.create(
-        snapshot.rig,
-        snapshot.markers,
-        eqx.tree_at(lambda o: o.visible, snapshot.obs, jnp.zeros_like(snapshot.obs.visible)),
-        0.3,
-    )
+    blind = dataclasses.replace(snapshot.obs, visible=jnp.asarray(np.zeros((4, 1), bool)))
+    nothing = snap(snapshot.rig, snapshot.markers, blind, 0.3)
     prior = priors(NEAR)
-    only = eqx.tree_at(lambda p: p.initialised, prior, jnp.arange(8) == 3)
+    only = eqx.tree_at(lambda p: p.initialised, prior, jnp.asarray(np.arange(8) == 3))
     decides = eqx.tree_at(lambda s: s.decided_mass, EXACT, MultiHypothesis().decided_mass)
     for sigma_deg in (2.0, 10.0, 40.0):
         P = np.diag([0.05, 0.05, 0, 0, 0, np.deg2rad(sigma_deg)]) ** 2
-        wide = eqx.tree_at(lambda p: p.covariance, only, jnp.tile(jnp.asarray(P), (8, 1, 1)))
+        wide = eqx.tree_at(lambda p: p.covariance, only, jnp.asarray(np.tile(P, (8, 1, 1))))
         selection = select(decides, wide, find(nothing), nothing)
         expected = 2 * scipy.stats.norm.sf(far_deg / sigma_deg)
         assert float(selection.flip_probability) == pytest.approx(expected, rel=1e-3, abs=1e-12)
@@ -637,30 +627,17 @@ def test_a_bank_without_room_for_a_fan_or_in_which_one_frame_decides_is_refused(
     MultiHypothesis(outlier_log_evidence=float(np.log(3e-5)) + 1e-6, decided_mass=3e-5)
 
 
-@pytest.fixture(scope="module")
-def kidnapped() -> tuple[np.ndarray, int, Seen]:
-    """Carried off after 2 s, by a metre and a quarter turn; the wheels tell nothing of it."""
-    frame = 30
+def test_it_recovers_from_being_carried_off():
+    """After 2 s, by a metre and a quarter turn; the wheels tell nothing of it. Ten rejected frames
+    start a new fan."""
+    frame, patience = 30, car().motion.max_rejections
     before = arc((1.2, 0.2, np.deg2rad(170.0)), 0.3, 0.0, frame)
     after = arc((-0.9, -0.4, np.deg2rad(20.0)), 0.3, 0.0, FRAMES - frame)
     poses = np.concatenate([before, after])
-    return poses, frame, run(car(), sensed(poses, 0.3))
-
-
-def test_ten_rejected_frames_start_a_new_fan(kidnapped):
-    _, frame, seen = kidnapped
-    patience = car().motion.max_rejections
-    assert np.all(seen.rejections[:, frame - 1] == 0)
-    np.testing.assert_array_equal(
-        seen.rejections[:, frame : frame + patience],
-        np.tile(np.arange(1, patience + 1), (SEEDS, 1)),
-    )
-    assert np.all(seen.rejections[:, frame + patience] == 0)
+    seen = run(car(), sensed(poses, 0.3), range(4))
+    rejected = seen.rejections[:, frame - 1 : frame + patience + 1]
+    np.testing.assert_array_equal(rejected, [[*range(patience + 1), 0]] * 4)
     assert np.all(seen.hypotheses[:, frame + patience] > seen.hypotheses[:, frame - 1])
-
-
-def test_it_recovers_from_being_carried_off(kidnapped):
-    poses, frame, seen = kidnapped
     position_m, _ = errors_of(seen, poses)
     assert np.max(position_m[:, frame - 1]) < 0.05
     assert np.min(position_m[:, frame]) > 1
@@ -736,21 +713,23 @@ def test_a_step_has_finite_gradients(precision):
 def test_what_is_no_other_candidate_is_no_flip():
     """Not the selected one itself, which a compiler may compute twice, nor one that merges with it;
     wherever it lies, the probability has a slope."""
-    yaw_deg = np.array([0.0, 0.0, 0.5, 40.0])
-    flip = jax.jit(nearer_to_another)
+    yaw_rad = jnp.asarray(np.deg2rad([0.0, 0.0, 0.5, 40.0]))
+    here = worlds.planar(0.0, 0.0, np.deg2rad(2.0)).wxyz_xyz
 
-    def probability(nudge_rad, selected: int, valid: list[bool]) -> jax.Array:
-        turns_rad = jnp.deg2rad(yaw_deg) + nudge_rad * jnp.array([0.0, 1.0, 0.0, 0.0])
-        Ts = jax.vmap(lambda psi: worlds.planar(0.0, 0.0, 0.0) @ yawed(psi))(turns_rad)
-        found = Candidates.none(4, float)
-        found = eqx.tree_at(
-            lambda c: (c.T_vehicle_world, c.valid), found, (Ts.inverse(), jnp.asarray(valid))
-        )
-        here = jaxlie.SE3(worlds.planar(0.0, 0.0, np.deg2rad(2.0)).wxyz_xyz[None])
-        return flip(here, 0.1**2 * jnp.eye(6)[None], found, jnp.asarray(selected))[0]
+    def of(nudge_rad, selected, valid) -> jax.Array:
+        turns_rad = yaw_rad + nudge_rad * jnp.array([0.0, 1.0, 0.0, 0.0])
+        Ts = jax.vmap(lambda psi: worlds.planar(0.0, 0.0, psi).inverse())(turns_rad)
+        found = dataclasses.replace(Candidates.none(4, float), T_vehicle_world=Ts, valid=valid)
+        return nearer_to_another(
+            jaxlie.SE3(here[None]), 0.1**2 * jnp.eye(6)[None], found, selected
+        )[0]
 
-    def yawed(psi_rad: jax.Array) -> jaxlie.SE3:
-        return jaxlie.SE3.from_rotation(jaxlie.SO3.from_z_radians(psi_rad))
+    value_and_slope = jax.jit(jax.value_and_grad(of))
+
+    def probability(nudge_rad, selected: int, valid: list[bool]) -> float:
+        value, slope = value_and_slope(nudge_rad, selected, jnp.asarray(valid))
+        assert np.isfinite(slope)
+        return float(value)
 
     expected = scipy.stats.norm.sf((20.0 - 2.0) / np.rad2deg(0.1))
     for nudge_rad in (0.0, 1e-12, 1e-9, 1e-7):
@@ -760,6 +739,4 @@ def test_what_is_no_other_candidate_is_no_flip():
             several = probability(nudge_rad, selected, [True] * 4)
             np.testing.assert_allclose(several, alone, rtol=0.2)
         assert probability(nudge_rad, 0, [True, True, True, False]) == 0
-        slope = jax.grad(probability)(nudge_rad, 0, [True] * 4)
-        assert np.isfinite(slope)
     assert probability(0.0, 3, [True] * 4) > 0.99

@@ -19,12 +19,13 @@ from jaxnav.core.filter.odometry import (
 )
 from jaxnav.core.filter.planar import BicycleKalman
 from jaxnav.core.models.imu import GYROS, Gyro
-from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase, velocity_world
+from jaxnav.core.models.vehicle import DEFAULT_TWIST_SIGMA, TwistBase
 from jaxnav.core.pose.observation import Observation
 from tests import worlds
 from tests.derivatives import check_derivatives
 from tests.helpers import filters
 from tests.helpers.filters import believing, level, predicted, stepped
+from tests.reference import paper
 
 NOISE, BIAS_SIGMA = 1e-3, 0.02
 GYRO = Gyro(NOISE, BIAS_SIGMA, bias_walk=0.0, saturation_radps=30.0)
@@ -45,15 +46,15 @@ def reading(twist=(0.0, 0.0, 0.0), gyro_radps=np.nan, dt_s=DT_S, **car) -> Obser
 def begun(motion: BicycleKalman, *poses, sigma=0.02):
     """Hypotheses of the same weight at these poses, whose velocity says nothing of the heading."""
     bank = motion.init(len(poses))
-    P = jnp.diag(jnp.asarray([sigma**2] * 3 + [1.0] * 3))
-    P = bank.covariance.at[:, :SIX, :SIX].set(P)
-    return believing(motion, bank.mean.at[:, :3].set(jnp.asarray(poses, float)), P)
+    mean, P = np.array(bank.mean), np.array(bank.covariance)
+    mean[:, :3], P[:, :SIX, :SIX] = poses, np.diag([sigma**2] * 3 + [1.0] * 3)
+    return believing(motion, mean, P)
 
 
 def test_a_twist_is_corrected_as_umbmark_says():
     """The errors in the order in which Borenstein and Feng name them, by hand."""
     mean = jnp.asarray(np.concatenate([[1.0, 2.0, 0.7], np.zeros(3), ERRORS]))
-    read = velocity_of_twist(jnp.asarray([0.5, 0.2, 9.0, 9.0, 9.0, 0.8]), mean)
+    read = jax.jit(velocity_of_twist)(jnp.asarray([0.5, 0.2, 9.0, 9.0, 9.0, 0.8]), mean)
     scale = 1 + 0.05 - 0.02
     x, y, turn = scale * 0.5, scale * 0.2, scale * (1.03 * 0.8 + 0.04 * 0.5)
     c, s = np.cos(0.7), np.sin(0.7)
@@ -63,27 +64,25 @@ def test_a_twist_is_corrected_as_umbmark_says():
         return velocity_of_twist(jnp.asarray([0.5, 0.2, 0.0, 0.0, 0.0, 0.8]), mean).velocity
 
     check_derivatives(velocity, mean)
-    slopes = jax.jacfwd(velocity)(mean)
+    slopes = jax.jit(jax.jacfwd(velocity))(mean)
     np.testing.assert_allclose(read.by_heading, slopes[:, 2], atol=1e-12)
     np.testing.assert_allclose(read.by_errors, slopes[:, SIX:], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("twist", "present"),
-    [
+def test_what_is_not_read_is_left_out():
+    mean, read = jnp.zeros(SIX), jax.jit(read_velocity)
+    for twist, present in (
         ((0.5, 0.0, np.nan), (1, 1, 0)),
         ((0.5, np.nan, 0.1), (0, 0, 1)),
         ((1e5, 0.0, 0.1), (0, 0, 1)),
         ((0.5, 0.0, 0.1), (1, 1, 1)),
-    ],
-)
-def test_what_is_not_read_is_left_out(twist, present):
-    obs, mean = reading(twist), jnp.zeros(SIX)
-    read = read_velocity(base(), obs, mean)
-    np.testing.assert_array_equal(read.present, present)
-    assert np.all(np.isfinite(read.velocity))
-    silent = dataclasses.replace(obs, has_odometry=jnp.asarray(False))
-    np.testing.assert_array_equal(read_velocity(base(), silent, mean).present, 0)
+    ):
+        obs = reading(twist)
+        found = read(base(), obs, mean)
+        np.testing.assert_array_equal(found.present, present)
+        assert np.all(np.isfinite(found.velocity))
+        silent = dataclasses.replace(obs, has_odometry=jnp.asarray(False))
+        np.testing.assert_array_equal(read(base(), silent, mean).present, 0)
 
 
 def test_a_car_is_one_way_to_make_a_twist():
@@ -94,14 +93,14 @@ def test_a_car_is_one_way_to_make_a_twist():
     bank, expected = begun(ours, [0.1, 0.2, 3.0]), begun(theirs, [0.1, 0.2, 3.0])
     for _ in range(20):
         speed, angle = rng.uniform(-1, 1), rng.uniform(-0.5, 0.5)
-        still = velocity_world(*map(jnp.asarray, (speed, angle, 0.0)), car.wheelbase_m)
+        still = paper.velocity(speed, angle, 0.0, float(car.wheelbase_m))
         obs = reading(still, speed_mps=speed, steering_rad=angle)
         bank, expected = predicted(ours, bank, obs), predicted(theirs, expected, obs)
     np.testing.assert_allclose(bank.mean, expected.mean, atol=1e-12)
     np.testing.assert_allclose(bank.covariance, expected.covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("gyro_radps", [np.nan, 30.0, -np.inf])
+@pytest.mark.parametrize("gyro_radps", [np.nan, 30.0])
 def test_a_gyro_that_is_silent_or_saturated_changes_nothing(gyro_radps):
     """Saturated at its limit, as a sensor reports it."""
     with_gyro = BicycleKalman(base(GYRO, DEFAULT_TWIST_SIGMA))
@@ -172,8 +171,8 @@ def test_a_turn_s_slopes_are_its_derivatives():
         turn = turn_of(off, reading(gyro_radps=1.3), mean, jnp.asarray(0.0))
         return jnp.stack([mean[2] + turn.turn_rad, turn.rate_radps])
 
-    slopes = turn_of(off, reading(gyro_radps=1.3), mean, jnp.asarray(0.0)).slopes
-    np.testing.assert_allclose(slopes, jax.jacfwd(of)(mean), atol=1e-12)
+    slopes = jax.jit(turn_of)(off, reading(gyro_radps=1.3), mean, jnp.asarray(0.0)).slopes
+    np.testing.assert_allclose(slopes, jax.jit(jax.jacfwd(of))(mean), atol=1e-12)
 
 
 def test_a_late_gyro_is_brought_forward():
@@ -224,8 +223,8 @@ def test_a_gyro_teaches_wheels_their_errors_and_their_slip(rate_radps):
     A = rng.normal(size=(n, 2 * n)) / np.sqrt(2 * n)
     P, mean = scale[:, None] * (A @ A.T) * scale, np.zeros(n)
     mean[5] = 0.8
-    read = read_velocity(base(), reading((0.5, 0.0, rate_radps)), jnp.asarray(mean))
-    turn = turn_of(GYRO, reading(gyro_radps=0.8), jnp.asarray(mean), jnp.asarray(0.0))
+    read = jax.jit(read_velocity)(base(), reading((0.5, 0.0, rate_radps)), jnp.asarray(mean))
+    turn = jax.jit(turn_of)(GYRO, reading(gyro_radps=0.8), jnp.asarray(mean), jnp.asarray(0.0))
     after, P_after = jax.jit(slip_of)(
         turn, read, jnp.asarray(0.01), jnp.asarray(mean), jnp.asarray(P)
     )

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -83,10 +82,10 @@ def test_small_motions_are_smoothed_as_by_one_least_squares_over_all_of_them():
     covariance = np.linalg.inv(information)
     expected = (covariance @ right).reshape(STEPS, 12)
 
-    still = jnp.zeros(13).at[0].set(1)
-    poses = jax.vmap(lambda xi: cayley(xi).wxyz_xyz)(jnp.asarray(z))
+    still = jnp.asarray(np.eye(13)[0])
+    poses = jax.jit(jax.vmap(lambda xi: cayley(xi).wxyz_xyz))(jnp.asarray(z))
     _, (mean, P) = run(motion, (still, P_FIRST), poses)
-    found = jax.vmap(lambda one: motion.difference(one, still))(mean)
+    found = jax.jit(jax.vmap(lambda one: motion.difference(one, still)))(mean)
     np.testing.assert_allclose(found, expected, atol=1e-4 * small)
     for step in range(STEPS):
         block = covariance[12 * step : 12 * step + 12, 12 * step : 12 * step + 12]
@@ -100,12 +99,9 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
     obs = dataclasses.replace(
         after(DT_S), speed_mps=jnp.asarray(1.0), steering_rad=jnp.asarray(0.0)
     )
-    nominal = jnp.zeros((STEPS, 6)).at[:, 0].set(DT_S * jnp.arange(STEPS)).at[:, 3].set(1)
-    P, R, H = (
-        jnp.diag(jnp.asarray([0.1] * 3 + [0.5] * 3) ** 2),
-        np.diag([0.02, 0.03, 0.01]) ** 2,
-        np.eye(3, 6),
-    )
+    nominal = np.zeros((STEPS, 6))
+    nominal[:, 0], nominal[:, 3] = DT_S * np.arange(STEPS), 1
+    P, R, H = (np.diag([0.1] * 3 + [0.5] * 3) ** 2, np.diag([0.02, 0.03, 0.01]) ** 2, np.eye(3, 6))
     z = small * rng.normal(size=(STEPS, 3))
 
     @jax.jit
@@ -114,14 +110,14 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
         correction, P, _ = kalman.update(P, innovation, jnp.asarray(H), jnp.asarray(R))
         return motion.moved(mean, correction), P
 
-    measured = np.asarray(nominal[:, :3]) + z
-    filtered = [correct(nominal[0], P, measured[0])]
+    measured = nominal[:, :3] + z
+    filtered = [correct(*map(jnp.asarray, (nominal[0], P, measured[0])))]
     for pose in measured[1:]:
         bank = predicted(motion, believing(motion, *filtered[-1]), obs)
         filtered.append(correct(bank.mean[0], bank.covariance[0], pose))
-    trail, back = filtered[-1:], jax.jit(smoothed)
+    trail, earlier = filtered[-1:], jax.jit(smoothed)
     for moments in filtered[-2::-1]:
-        trail.insert(0, back(motion, moments, trail[0], obs))
+        trail.insert(0, earlier(motion, moments, trail[0], obs))
 
     A = np.eye(6) + DT_S * np.eye(6, k=3)
     Q = np.asarray(kalman.white_acceleration(motion.acceleration_density, DT_S))
@@ -148,13 +144,19 @@ def test_a_car_is_smoothed_with_its_odometry_as_by_one_least_squares():
         np.testing.assert_allclose(found, block, atol=1e-5 * block.max())
 
 
+begin, back = jax.jit(Trail.begin), jax.jit(Trail.back)
+doubted = jax.jit(lambda motion, trail, bank: doubt(motion, trail.as_bank(bank), 0.5))
+
+
 def bank_of(motion, turns_rad, log_weight, initialised, parent):
     """Four hypotheses at the origin that look in different directions."""
-    bank, turns = motion.init(4), np.stack([level(psi_rad=turn) for turn in turns_rad])
+    bank = motion.init(4)
+    mean = np.array(bank.mean)
+    mean[:, :7] = [level(psi_rad=turn) for turn in turns_rad]
     return dataclasses.replace(
         bank,
-        mean=bank.mean.at[:, :7].set(turns),
-        covariance=bank.covariance * 1e-4,
+        mean=jnp.asarray(mean),
+        covariance=jnp.asarray(np.asarray(bank.covariance) * 1e-4),
         log_weight=jnp.asarray(log_weight, float),
         initialised=jnp.asarray(initialised),
         parent=jnp.asarray(parent),
@@ -168,18 +170,18 @@ def test_a_trail_goes_back_through_the_slots_that_its_hypotheses_were_in():
     chosen = bank_of(
         motion, (0.1, 1.5, 0.9, 0), (-0.1, -5, -3, -9), (yes, yes, yes, no), (2, 1, 2, 3)
     )
-    trail = Trail.begin(chosen, jnp.asarray(True))
+    trail = begin(chosen, jnp.asarray(True))
     np.testing.assert_array_equal(trail.slots, [0, 1, 2, -1])
-    earlier = jax.jit(Trail.back)(trail, motion, forked, jnp.asarray(False), chosen.parent, obs)
+    earlier = back(trail, motion, forked, jnp.asarray(False), chosen.parent, obs)
     np.testing.assert_array_equal(earlier.slots, [2, 1, 2, -1])
     assert bool(earlier.decided)
     np.testing.assert_allclose(earlier.mean[:7], forked.mean[2, :7], atol=1e-3)
 
     # Both of what became of slot 2 were the same there: 1.4 rad off is slot 1 alone.
     mass = np.exp([-0.1, -5, -3]) / np.exp([-0.1, -5, -3]).sum()
-    far = doubt(motion, trail.as_bank(chosen), 0.5)
+    far = doubted(motion, trail, chosen)
     assert float(far) == pytest.approx(mass[1] + mass[2], abs=1e-6)
-    far = doubt(motion, earlier.as_bank(forked), 0.5)
+    far = doubted(motion, earlier, forked)
     assert float(far) == pytest.approx(mass[1], abs=1e-6)
 
 
@@ -190,10 +192,10 @@ def test_a_trail_ends_where_its_hypotheses_began(end):
     before = bank_of(motion, (0.7, 0.0, 0.0, 0.0), (0.0, 0, 0, 0), lives, range(4))
     parent = (-1, -1, -1, -1)
     if end != "a start":
-        before, parent = eqx.tree_at(lambda b: b.initialised, before, jnp.zeros(4, bool)), range(4)
+        before, parent = dataclasses.replace(before, initialised=jnp.zeros(4, bool)), range(4)
     later = bank_of(motion, (0.0,) * 4, (0.0,) * 4, lives, parent)
-    trail = Trail.begin(later, jnp.asarray(True))
-    trail = jax.jit(Trail.back)(trail, motion, before, jnp.asarray(False), later.parent, obs)
+    trail = begin(later, jnp.asarray(True))
+    trail = back(trail, motion, before, jnp.asarray(False), later.parent, obs)
     assert not bool(trail.decided)
     assert bool(trail.as_bank(before).initialised[0]) == (end == "a start")
     np.testing.assert_array_equal(trail.mean, before.mean[0])
@@ -201,8 +203,10 @@ def test_a_trail_ends_where_its_hypotheses_began(end):
 
 def test_what_is_not_finite_leaves_the_filters_state():
     motion = ConstantVelocity()
-    mean, P = jnp.zeros(13).at[0].set(1), P_FIRST
-    broken = mean, P.at[3, 3].set(jnp.nan)
+    mean, P = jnp.asarray(np.eye(13)[0]), P_FIRST
+    broken = np.array(P)
+    broken[3, 3] = np.nan
+    broken = mean, jnp.asarray(broken)
     found = jax.jit(smoothed)(motion, (mean, P), broken, after(0.1))
     np.testing.assert_array_equal(found[0], mean)
     np.testing.assert_array_equal(found[1], P)

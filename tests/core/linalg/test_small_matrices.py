@@ -5,12 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnav.core.linalg import small_matrices as small
+from jaxnav.core.linalg import small_matrices
 from tests.derivatives import check_derivatives
+from tests.helpers.compiling import jitted
+
+small = jitted(small_matrices, in_order="count")
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("n", [1, 3, 6])
+@pytest.mark.parametrize("n", [1, 6])
 def test_a_batch_of_systems_is_solved_as_lapack_does(n, dtype):
     rng = np.random.default_rng(n)
     roots = rng.normal(size=(50, n, n + 2))
@@ -35,7 +38,7 @@ def test_a_batch_of_systems_is_solved_as_lapack_does(n, dtype):
     np.testing.assert_allclose(log_det, np.linalg.slogdet(A)[1], atol=tolerance)
 
 
-@pytest.mark.parametrize("shape", [(6, 6, 6), (3, 12, 5), (2, 1, 4)])
+@pytest.mark.parametrize("shape", [(3, 12, 5), (2, 1, 4)])
 def test_products(shape):
     n, k, m = shape
     rng = np.random.default_rng(2)
@@ -54,7 +57,7 @@ def test_gradients_are_those_of_lapack():
     rng = np.random.default_rng(1)
     root = rng.normal(size=(3, 5))
     A, b = jnp.asarray(root @ root.T), jnp.asarray(rng.normal(size=3))
-    ours = jax.grad(lambda A: b @ small.cho_solve(small.cholesky(A), b))(A)
+    ours = np.asarray(jax.jit(jax.grad(lambda A: b @ small.cho_solve(small.cholesky(A), b)))(A))
     x = np.linalg.solve(A, b)
     # Of A and its transpose together: of a symmetric matrix no more is defined.
     expected = -np.outer(x, x)
@@ -86,7 +89,7 @@ def test_derivatives_are_those_of_differences(n):
     check_derivatives(all_of, A, many, jnp.asarray(0.3))
 
 
-@pytest.mark.parametrize("n", [1, 3, 6])
+@pytest.mark.parametrize("n", [1, 6])
 def test_many_positive_systems_side_by_side(n):
     rng = np.random.default_rng(n)
     roots = rng.normal(size=(20, n, n + 2))
@@ -96,7 +99,7 @@ def test_many_positive_systems_side_by_side(n):
     assert not np.any(np.isfinite(small.solve_positive(-jnp.eye(n), jnp.ones(n))))
 
 
-@pytest.mark.parametrize("n", [1, 5, 11])
+@pytest.mark.parametrize("n", [1, 11])
 def test_elimination_solves_for_all_right_sides_like_lapack(n):
     rng = np.random.default_rng(n)
     root = rng.normal(size=(n, n + 2)) * np.geomspace(1, 1e3, n)[:, None]

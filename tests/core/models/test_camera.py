@@ -11,7 +11,7 @@ import pytest
 
 from jaxnav.core.models.camera import LENS_COEFFICIENTS, Camera, stack_cameras
 from jaxnav.core.models.lenses import LENSES
-from tests.derivatives import check_derivatives
+from tests.derivatives import check_derivatives, in_float32
 from tests.reference import lenses as papers
 
 # Lens, coefficients, focal length, image size, half angle of view in degrees along the diagonal.
@@ -86,11 +86,12 @@ def unproject(camera, pixels):
 def slopes(camera, points, pixels):
     return (
         camera.project(points),
-        jax.vmap(jax.jacfwd(camera.project))(points),
         jax.vmap(jax.jacrev(camera.project))(points),
-        jax.vmap(jax.jacfwd(camera.unproject))(pixels),
         jax.vmap(jax.jacrev(camera.unproject))(pixels),
     )
+
+
+IN_FLOAT64 = [pytest.param("float32", marks=pytest.mark.long), "float64"]
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -101,6 +102,7 @@ def test_lens_projects_as_its_authors_do(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("precision", IN_FLOAT64, indirect=True)
 def test_lens_is_inverted_over_the_whole_image(name, precision):
     pixels = all_pixels(name)
     rays, again, in_front = unproject(build(name), jnp.asarray(pixels))
@@ -148,14 +150,14 @@ def test_lens_is_finite_everywhere(name, precision):
             [1e-12, -1e-12, -5.0],
         ]
     )
-    pixels = jnp.asarray([[-1e6, 0.0], [1e5, 1e5], [3000.0, -2000.0], [0.0, 0.0]])
-    pixels = jnp.concatenate([pixels, camera.center_px[None]])
+    pixels = [[-1e6, 0.0], [1e5, 1e5], [3000.0, -2000.0], [0.0, 0.0], camera.center_px]
+    pixels = jnp.asarray(np.array(pixels), float)
     for values in slopes(camera, points, pixels):
         assert values.dtype == precision
         assert np.all(np.isfinite(values))
 
 
-@pytest.mark.parametrize("name", ONE_A_KIND)
+@pytest.mark.parametrize("name", ["none", "equidistant k"])
 def test_lens_takes_any_batch(name):
     camera, flat = build(name), points_in_view(name, 6, seed=3)
     pixels = project(camera, jnp.asarray(flat.reshape(3, 1, 2, 3)))
@@ -175,7 +177,7 @@ def test_what_lies_behind_is_not_in_front():
 
 
 def test_behind_a_pinhole_lands_outside_on_the_right_side():
-    pixel = build("none").project(jnp.asarray([0.1, -0.2, -1.0]))
+    pixel = project(build("none"), jnp.asarray([0.1, -0.2, -1.0]))
     assert pixel[0] > 640 * 10
     assert pixel[1] < -480 * 10
 
@@ -183,10 +185,10 @@ def test_behind_a_pinhole_lands_outside_on_the_right_side():
 def test_a_pixel_without_a_ray_does_not_project_back():
     # This lens folds back at some radius: no ray reaches the far corner.
     camera = Camera.create((400.0, 400.0), (320.0, 240.0), "radtan", [-0.4])
-    pixel = jnp.asarray([1000.0, 900.0])
-    ray, again, _ = unproject(camera, pixel)
-    assert np.all(np.isfinite(ray))
-    assert np.linalg.norm(again - pixel) > 50
+    pixels = jnp.asarray(np.tile([1000.0, 900.0], (1000, 1)))
+    rays, again, _ = unproject(camera, pixels)
+    assert np.all(np.isfinite(rays))
+    assert np.linalg.norm(again[0] - pixels[0]) > 50
 
 
 def test_a_rig_of_mixed_lenses_keeps_each_camera_s_own():
@@ -276,13 +278,14 @@ def test_a_lens_finds_every_ray_that_it_sees(lens, precision):
 
 
 @pytest.mark.parametrize("lens", papers.BY_NAME)
-def test_a_wide_lens_ends_where_its_image_turns_back(lens):
+@in_float32
+def test_a_wide_lens_ends_where_its_image_turns_back(lens, precision):
     """Or where it goes to infinity; what lies beyond is drawn into the image, and refused."""
-    angles = np.linspace(0.001, 3.14, 3601)
+    angles = np.linspace(0.001, 3.14, 4001)
     rays = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
     for coefficients in FIELDS[lens]:
         camera = Camera.create((1.0, 1.0), (0.0, 0.0), lens, coefficients)
-        seen = np.asarray(seen_again(camera, jnp.asarray(rays))[0])
+        seen = np.asarray(seen_again(camera, jnp.asarray(rays, float))[0])
         radii = np.array([papers.BY_NAME[lens](ray, coefficients)[0] for ray in rays])
         falls = np.diff(radii, append=-1) <= 0  # past infinity they are negative
         end = angles[np.argmax(falls)]

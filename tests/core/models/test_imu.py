@@ -27,19 +27,16 @@ NOISE = ImuNoise(2e-3, 3e-2, 4e-3, 5e-2, 0.05, 0.2)
 run = eqx.filter_jit(preintegrate)
 
 
-def readings(gyro, accel, dt_s, bridged=None) -> Readings:
+def readings(gyro, accel, dt_s, still=False) -> Readings:
     count = len(gyro)
-    bridged = np.zeros(count, bool) if bridged is None else bridged
     dt = jnp.broadcast_to(jnp.asarray(dt_s, float), (count,))
     numbers = jnp.asarray(gyro, float), jnp.asarray(accel, float), dt
-    return Readings(*numbers, jnp.asarray(bridged), jnp.asarray(False))
+    return Readings(*numbers, jnp.zeros(count, bool), jnp.asarray(still))
 
 
-def random_readings(count=20, seed=0, fixed_axis=False):
+def random_readings(count=20, seed=0):
     rng = np.random.default_rng(seed)
     gyro = rng.normal(size=(count, 3)) * 3
-    if fixed_axis:
-        gyro = np.array([0.36, -0.48, 0.8]) * rng.normal(size=(count, 1)) * 5
     return gyro, rng.normal(size=(count, 3)) * 5 + [0, 0, 9.8]
 
 
@@ -61,7 +58,7 @@ def error(measured, reference) -> np.ndarray:
 
 
 def parts(result: Preintegrated):
-    R = np.asarray(result.R_begin_end.as_matrix())
+    R = Rotation.from_quat(np.roll(result.R_begin_end.wxyz, -1)).as_matrix()
     return R, np.asarray(result.velocity_mps), np.asarray(result.position_m)
 
 
@@ -149,21 +146,13 @@ def in_our_order(covariance, turn, biases=False):
     Between increments and walks GTSAM 4.3 has the other sign; differences, above, tell which.
     """
     J = np.diag(np.r_[np.ones(9), -np.ones(6)][: len(covariance)])
-    J[:3, :3] = right_jacobian(jnp.asarray(turn))
+    J[:3, :3] = jax.jit(right_jacobian)(jnp.asarray(turn))
     order = np.r_[0:3, 6:9, 3:6, 12:15, 9:12] if biases else np.r_[0:3, 6:9, 3:6]
     return (J @ covariance @ J.T)[np.ix_(order, order)]
 
 
 def need_gtsam():
     return pytest.importorskip("gtsam", reason="gtsam, the oracle, has no wheel here")
-
-
-def test_gtsam_integrates_a_turn_about_one_axis_to_the_same_numbers():
-    """GTSAM adds rotation vectors up, which for one axis is the product of the rotations."""
-    gyro, accel = random_readings(40, fixed_axis=True)
-    result = run(readings(gyro, accel, 0.01), NOISE)
-    measured = gtsam_of(need_gtsam(), gyro, accel, 0.01)
-    np.testing.assert_allclose(error(parts(result), of_gtsam(measured)), 0, atol=1e-9)
 
 
 def test_gtsam_s_increments_covariance_and_walks_are_the_limit_of_ours():
@@ -239,7 +228,9 @@ def one_of(result: Preintegrated, index: int) -> Preintegrated:
     return jax.tree.map(lambda leaf: leaf[index], result)
 
 
-@pytest.mark.parametrize(("rate_hz", "tolerance"), [(200.0, 5e-4), (800.0, 4e-5)])
+@pytest.mark.parametrize(
+    ("rate_hz", "tolerance"), [(200.0, 5e-4), pytest.param(800.0, 4e-5, marks=pytest.mark.long)]
+)
 def test_samples_of_a_trajectory_give_its_own_increments(rate_hz, tolerance):
     """Of intervals that begin and end between samples; 16 times as exact at 4 times the rate."""
     result = samples(rate_hz).between(STAMPS_NS.astype(np.int64))
@@ -320,8 +311,9 @@ def test_the_first_order_correction_is_that_of_integrating_anew():
     gaps = []
     for size in (1.0, 0.1):
         biases = size * jnp.asarray([0.02, -0.03, 0.01]), size * jnp.asarray([0.2, -0.1, 0.3])
-        R, v, p = result.at_biases(*biases)
-        corrected = np.asarray(R.as_matrix()), np.asarray(v), np.asarray(p)
+        R, v, p = eqx.filter_jit(Preintegrated.at_biases)(result, *biases)
+        R = Rotation.from_quat(np.roll(R.wxyz, -1)).as_matrix()
+        corrected = R, np.asarray(v), np.asarray(p)
         anew = parts(run(rows, NOISE, *biases))
         gaps.append(np.max(np.abs(error(corrected, anew))))
         assert np.max(np.abs(error(corrected, parts(result)))) > 100 * gaps[-1]
@@ -378,7 +370,7 @@ def test_gradients_are_finite_at_rest_and_without_a_reading(precision):
 
     zero = jnp.zeros((4, 3))
     slope = jax.jit(jax.grad(total, argnums=(0, 1)))
-    for dt_s in (jnp.full(4, 0.01), jnp.zeros(4), jnp.full(4, jnp.nan)):
+    for dt_s in (jnp.full(4, 0.01, float), jnp.zeros(4), jnp.full(4, jnp.nan, float)):
         for leaf in jax.tree.leaves(slope((zero, zero), dt_s)):
             assert leaf.dtype == precision
             assert np.all(np.isfinite(leaf)) or np.isnan(dt_s[0])

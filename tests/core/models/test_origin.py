@@ -29,6 +29,7 @@ from jaxnav.core.models.origin import (
 )
 from jaxnav.drive.flags import Health
 from jaxnav.files import Route, calib_dir, load_markers, load_route, poses, save_markers, write_tum
+from jaxnav.files.configuration import step_folder
 from jaxnav.files.markers import MarkerFile, marker_map
 from jaxnav.files.vehicles import RouteFile
 from jaxnav.pictures.rerun.scene import RerunScene
@@ -156,7 +157,8 @@ class Driven:
     def __init__(self, by_m, duration_s: float = 7.0):
         self.setup = shifted_setup(by_m, float64=False)
         origin_m, at = self.setup.markers.origin_m, np.array(self.setup.route.start_pose[:2])
-        self.steps = simulated(self.setup, duration_s)
+        # The program that the commands below load too.
+        self.steps = simulated(self.setup, duration_s, step_folder())
         self.healths = np.array([step.outcome.health for step in self.steps])
         poses = np.array([step.outcome.pose for step in self.steps])
         truth = np.array([planar_in_world(step.truth[:3], origin_m) for step in self.steps])
@@ -201,7 +203,7 @@ def test_a_recording_holds_the_world_and_replays_to_the_bits(away, tmp_path):
     comparison = Comparison(log)
     with jax.enable_x64(False):
         setup = DriveSetup.from_header(log.header, path)
-        for outcome in replay_drive(log.inputs, setup, None):
+        for outcome in replay_drive(log.inputs, setup, step_folder()):
             comparison.look(outcome)
     assert comparison.first is None
     assert comparison.compared == 120
@@ -210,7 +212,7 @@ def test_a_recording_holds_the_world_and_replays_to_the_bits(away, tmp_path):
     comparison = Comparison(dataclasses.replace(log, header=log.header | {"made_by": {}}))
     assert not comparison.bit_for_bit
     with jax.enable_x64(False):
-        for outcome in replay_drive(log.inputs[:80], setup, None):
+        for outcome in replay_drive(log.inputs[:80], setup, step_folder()):
             comparison.look(outcome)
     assert comparison.first is not None
     assert comparison.first.what.startswith("pose")

@@ -1,5 +1,8 @@
 """Which sightings count, and which parts of a broken observation are kept."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,84 +24,100 @@ def image_areas(corners_px):
     return np.abs(np.sum(x * np.roll(y, -1, -1) - y * np.roll(x, -1, -1), axis=-1)) / 2
 
 
+@functools.partial(jax.jit, static_argnames="count")
+def slots_of(room, corners_px, visible, sigma_px=1.0, count=16):
+    return sightings(*room[:2], corners_px, visible, sigma_px, count)
+
+
+usable = jax.jit(Observation.usable)
+
+
 def test_every_lane_has_its_slot(room):
-    rig, markers, obs = room
-    seen = sightings(rig, markers, obs.corners_px, obs.visible)
+    obs = room[2]
+    seen = slots_of(room, obs.corners_px, obs.visible)
     assert seen.visible.shape == (16,)
     np.testing.assert_array_equal(seen.visible.reshape(4, 4), obs.visible)
-    for slot in np.flatnonzero(seen.visible):
-        lane = (int(seen.camera_index[slot]), int(seen.marker_index[slot]))
-        np.testing.assert_array_equal(seen.corners_px[slot], obs.corners_px[lane])
+    lanes = np.asarray(seen.camera_index), np.asarray(seen.marker_index)
+    shown = np.asarray(seen.visible)
+    expected = np.asarray(obs.corners_px)[lanes]
+    np.testing.assert_array_equal(np.asarray(seen.corners_px)[shown], expected[shown])
 
 
 def test_few_slots_keep_the_largest_images(room):
-    rig, markers, obs = room
+    obs = room[2]
     areas = np.where(obs.visible, image_areas(obs.corners_px), -1).ravel()
-    for count in (1, 3, 8):
-        seen = sightings(rig, markers, obs.corners_px, obs.visible, 1.0, count)
+    for count in (1, 3):
+        seen = slots_of(room, obs.corners_px, obs.visible, count=count)
         kept = np.asarray(seen.camera_index) * 4 + np.asarray(seen.marker_index)
-        np.testing.assert_array_equal(kept[seen.visible], np.argsort(-areas)[:count][seen.visible])
-        assert np.sum(seen.visible) == min(count, np.sum(obs.visible))
+        shown = np.asarray(seen.visible)
+        np.testing.assert_array_equal(kept[shown], np.argsort(-areas)[:count][shown])
+        assert np.sum(shown) == min(count, np.sum(obs.visible))
 
 
-@pytest.mark.parametrize(("count", "slots"), [(1, 2), (4, 8), (9, 16)])
-def test_two_views_of_every_marker_have_a_slot_and_sixteen_at_most(count, slots):
+def test_two_views_of_every_marker_have_a_slot_and_sixteen_at_most():
     rig = worlds.qcar_rig()
-    markers = worlds.marker_map(
-        [(worlds.upright(0.3 * k), [1.0, 0.2 * k, 0.2]) for k in range(count)], [0.172] * count
-    )
-    obs = Observation(jnp.zeros((len(rig), count, 4, 2)), jnp.zeros((len(rig), count), bool))
-    assert Snapshot.create(rig, markers, obs).seen.visible.shape == (slots,)
-    assert Snapshot.create(rig, markers, obs, max_sightings=3).seen.visible.shape == (3,)
+    for count, slots in ((1, 2), (4, 8), (9, 16)):
+        markers = worlds.marker_map([(np.eye(3), [1.0, 0.2 * k, 0.2]) for k in range(count)],
+                                    [0.172] * count)  # fmt: skip
+        lanes = len(rig), count
+        obs = Observation(jnp.zeros((*lanes, 4, 2)), jnp.zeros(lanes, bool))
+        for most, expected in ((None, slots), (3, min(3, 4 * count))):
+            create = functools.partial(Snapshot.create, max_sightings=most)
+            assert jax.eval_shape(create, rig, markers, obs).seen.visible.shape == (expected,)
 
 
 def test_hidden_lanes_are_finite_whatever_they_held(room):
-    rig, markers, obs = room
-    for filler in (np.nan, np.inf, 0.0, 1e30):
-        corners = jnp.where(obs.visible[:, :, None, None], obs.corners_px, filler)
-        for count in (16, 4):
-            seen = sightings(rig, markers, corners, obs.visible, 1.0, count)
-            clean = sightings(rig, markers, obs.corners_px, obs.visible, 1.0, count)
+    obs = room[2]
+    hidden = ~np.asarray(obs.visible)
+    for count in (16, 3):
+        clean = slots_of(room, obs.corners_px, obs.visible, count=count)
+        for filler in (np.nan, np.inf, 0.0, 1e30):
+            corners = np.array(obs.corners_px)
+            corners[hidden] = filler
+            seen = slots_of(room, jnp.asarray(corners), obs.visible, count=count)
             np.testing.assert_array_equal(seen.corners_px, clean.corners_px)
             assert np.all(np.isfinite(seen.corners_px))
 
 
-@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
-def test_a_lane_with_a_broken_corner_is_not_visible(room, broken):
-    rig, markers, obs = room
-    corners = obs.corners_px.at[0, 0, 2, 1].set(broken)
-    seen = sightings(rig, markers, corners, obs.visible)
-    assert not seen.visible[0]
-    assert np.sum(seen.visible) == np.sum(obs.visible) - 1
-    assert np.all(np.isfinite(seen.corners_px))
-    assert not Observation(corners, obs.visible).usable().visible[0, 0]
+def test_a_lane_with_a_broken_corner_or_without_a_positive_sigma_is_not_visible(room):
+    obs = room[2]
+    cases = [(value, None) for value in (np.nan, np.inf, -np.inf)]
+    cases += [(None, value) for value in (np.nan, np.inf, 0.0, -1.0)]
+    for corner_px, sigma_px in cases:
+        corners, sigmas = np.array(obs.corners_px), np.full((4, 4, 4), 0.3)
+        if corner_px is None:
+            sigmas[0, 1, 3] = sigma_px
+        else:
+            corners[0, 1, 2, 1] = corner_px
+        corners, sigmas = jnp.asarray(corners), jnp.asarray(sigmas)
+        seen = slots_of(room, corners, obs.visible, sigmas)
+        assert not seen.visible[1], (corner_px, sigma_px)
+        assert np.sum(seen.visible) == np.sum(obs.visible) - 1
+        assert np.all(np.isfinite(seen.corners_px))
+        assert np.all(np.asarray(seen.sigma_px) > 0)
+        whole = usable(Observation(corners, obs.visible)).visible
+        assert bool(whole[0, 1]) == (corner_px is None)
 
 
-@pytest.mark.parametrize("broken", [np.nan, np.inf, 0.0, -1.0])
-def test_a_lane_without_a_positive_sigma_is_not_visible(room, broken):
-    rig, markers, obs = room
-    sigma = jnp.full((4, 4, 4), 0.3).at[0, 1, 3].set(broken)
-    seen = sightings(rig, markers, obs.corners_px, obs.visible, sigma)
-    assert not seen.visible[1]
-    assert np.sum(seen.visible) == np.sum(obs.visible) - 1
-    assert np.all(seen.sigma_px > 0)
+def test_broken_odometry_is_no_odometry(room):
+    obs = room[2]
 
+    def told(**reading):
+        numbers = {"speed_mps": 0.4, "steering_rad": 0.1, "dt_s": 0.1} | reading
+        numbers = {name: jnp.asarray(value) for name, value in numbers.items()}
+        return usable(Observation(obs.corners_px, obs.visible, **numbers))
 
-@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf, 1e30])
-def test_broken_odometry_is_no_odometry(room, broken):
-    *_, obs = room
-    good = {"speed_mps": jnp.asarray(0.4), "steering_rad": jnp.asarray(0.1)}
-    usable = Observation(obs.corners_px, obs.visible, **good, dt_s=0.1).usable()
-    assert usable.has_odometry
-    assert (usable.speed_mps, usable.steering_rad, usable.dt_s) == (0.4, 0.1, 0.1)
-    for key in good:
-        reading = good | {key: jnp.asarray(broken)}
-        usable = Observation(obs.corners_px, obs.visible, **reading).usable()
-        assert not usable.has_odometry
-        assert np.isfinite(usable.speed_mps)
-        assert np.isfinite(usable.steering_rad)
-    for dt_s in (broken, -0.1):
-        assert Observation(obs.corners_px, obs.visible, dt_s=dt_s).usable().dt_s == 0
+    good = told()
+    assert good.has_odometry
+    assert (good.speed_mps, good.steering_rad, good.dt_s) == (0.4, 0.1, 0.1)
+    for broken in (np.nan, np.inf, -np.inf, 1e30):
+        for key in ("speed_mps", "steering_rad"):
+            found = told(**{key: broken})
+            assert not found.has_odometry, (key, broken)
+            assert np.isfinite(found.speed_mps)
+            assert np.isfinite(found.steering_rad)
+        assert told(dt_s=broken).dt_s == 0
+    assert told(dt_s=-0.1).dt_s == 0
 
 
 def test_wrong_shapes_are_told(room):

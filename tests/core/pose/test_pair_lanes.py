@@ -10,6 +10,7 @@ from jaxnav.core.pose import pair_lanes
 from jaxnav.core.pose.ippe import ippe_square
 from jaxnav.core.pose.refine import solve_marker, solve_markers
 from tests import worlds
+from tests.reference.rigid import matrix
 
 BATCH, FOCAL_PX = 64, 500.0
 general = jax.jit(jax.vmap(solve_marker))
@@ -62,7 +63,9 @@ def costs_of(pair, corners: np.ndarray, size: np.ndarray) -> np.ndarray:
 def test_the_closed_form_is_that_of_one_marker(precision):
     corners, size = views()
     corners, size = jnp.asarray(corners, precision), jnp.asarray(size, precision)
-    pair, expected = closed(corners, size), jax.jit(jax.vmap(ippe_square))(corners, size)
+    pair, expected = (
+        jax.device_get(solve(corners, size)) for solve in (closed, jax.jit(jax.vmap(ippe_square)))
+    )
     assert pair.reprojection_error.dtype == precision
     eps = jnp.finfo(precision).eps
     apart = np.abs(pair.reprojection_error - expected.reprojection_error)
@@ -71,8 +74,7 @@ def test_the_closed_form_is_that_of_one_marker(precision):
     clear = clear & (np.arange(BATCH) < 40)
     assert np.sum(clear) > 20
     angles = worlds.rotation_angles_rad(
-        np.asarray(pair.T_camera_marker.rotation().as_matrix(), float)[clear],
-        np.asarray(expected.T_camera_marker.rotation().as_matrix(), float)[clear],
+        *(matrix(one.T_camera_marker.wxyz_xyz)[clear, :, :3, :3] for one in (pair, expected))
     )
     assert np.max(angles) < 100 * eps
 
@@ -127,7 +129,7 @@ def test_a_lane_knows_nothing_of_the_others(precision):
         assert np.all(np.isfinite(np.asarray(beside)[24]))
 
 
-@pytest.mark.parametrize("batch", [1, 37])
+@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.long), 37])
 def test_a_lane_does_not_know_how_many_there_are(batch):
     """The same bits from a batch of another length, which is another program."""
     corners, size = map(jnp.asarray, views())
@@ -154,32 +156,57 @@ def test_an_empty_batch():
         assert pair.reprojection_error.shape == (0, 2)
 
 
-def test_gradients_are_those_of_one_marker_and_differences():
-    """Left out: exact corners, and poses so flat that a step of 1e-6 is not small."""
-    corners, size = map(jnp.asarray, views())
-    weights = jnp.asarray(np.random.default_rng(3).normal(size=(1, 2, 8)))
+CORNERS, SIZES = views()
+WEIGHTS = np.random.default_rng(3).normal(size=(1, 2, 8))
 
-    def seen(solve, corners, size):
-        pair = solve(corners, size)
-        pose = pair.T_camera_marker.wxyz_xyz / size[:, None, None]
-        numbers = jnp.concatenate([pose, pair.reprojection_error[..., None]], axis=-1)
-        return jnp.sum(weights * numbers, axis=(1, 2))
 
-    def slopes(solve):
-        return jax.jit(jax.grad(lambda *x: jnp.sum(seen(solve, *x)), (0, 1)))(corners, size)
+def numbers(solve, corners, size):
+    """A sum of all that is found of each marker (B,)."""
+    pair = solve(corners, size)
+    pose = pair.T_camera_marker.wxyz_xyz / size[:, None, None]
+    told = jnp.concatenate([pose, pair.reprojection_error[..., None]], axis=-1)
+    return jnp.sum(WEIGHTS * told, axis=(1, 2))
 
-    ours, theirs = slopes(solve_markers), slopes(jax.vmap(solve_marker))
-    change = np.random.default_rng(4).normal(size=(BATCH, 4, 2))
-    step = 1e-6
-    difference = (
-        seen(solve_markers, corners + step * change, size * (1 + step))
-        - seen(solve_markers, corners - step * change, size * (1 - step))
-    ) / (2 * step)
-    along = np.sum(ours[0] * change, axis=(1, 2)) + np.asarray(ours[1] * size)
-    scale = np.sqrt(np.sum(np.square(ours[0]), axis=(1, 2)))
+
+def slopes(solve):
+    """By corners and size: the markers know nothing of each other."""
+
+    @jax.jit
+    def both(corners, size):
+        values, pull = jax.vjp(lambda *x: numbers(solve, *x), corners, size)
+        return values, pull(jnp.ones_like(values))
+
+    return both
+
+
+def in_proportion(by_corner):
+    """How large the slopes are, and which count: not of exact corners, nor of poses so flat that a
+    step of 1e-6 is not small."""
+    scale = np.sqrt(np.sum(np.square(by_corner), axis=(1, 2)))
     fair = (scale < 300) & (np.arange(BATCH) >= 8)
     assert np.sum(fair) > 20
-    assert np.max(np.abs(along - difference)[fair] / scale[fair]) < 2e-3
+    return scale[fair], fair
+
+
+def test_gradients_are_differences():
+    both, step = slopes(solve_markers), 1e-6
+    _, (by_corner, by_size) = jax.device_get(both(CORNERS, SIZES))
+    change = np.random.default_rng(4).normal(size=(BATCH, 4, 2))
+    ahead, behind = (
+        np.asarray(both(CORNERS + h * change, SIZES * (1 + h))[0]) for h in (step, -step)
+    )
+    along = np.sum(by_corner * change, axis=(1, 2)) + by_size * SIZES
+    scale, fair = in_proportion(by_corner)
+    assert np.max(np.abs(along - (ahead - behind) / (2 * step))[fair] / scale) < 2e-3
+
+
+@pytest.mark.long
+def test_gradients_are_those_of_one_marker():
+    ours, theirs = (
+        jax.device_get(slopes(solve)(CORNERS, SIZES)[1])
+        for solve in (solve_markers, jax.vmap(solve_marker))
+    )
+    scale, fair = in_proportion(ours[0])
     for mine, general_one in zip(ours, theirs, strict=True):
         apart = np.abs(mine - general_one).reshape(BATCH, -1)
-        assert np.max(apart[fair] / scale[fair, None]) < 1e-5
+        assert np.max(apart[fair] / scale[:, None]) < 1e-5
