@@ -37,6 +37,7 @@ def test_the_likelier_pose_is_near_the_truth_and_the_other_is_not():
     assert told["error_m"][0] < 0.02
 
 
+@pytest.mark.long
 def test_the_car_decides_and_drives_to_its_waypoints():
     time_s, error_m, out = importlib.import_module("drive").main(duration_s=20.0)
     assert out.done

@@ -14,6 +14,7 @@ pytest.importorskip("mkdocstrings", reason="the extra `docs` is not installed: m
 ROOT = Path(__file__).parents[1]
 
 
+@pytest.mark.long
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}

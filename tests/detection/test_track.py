@@ -66,7 +66,9 @@ def near(quad_px, rng, off_px=3.0, radius_px=4.5, **streak):
     return Target(FAMILY, 17, places_px, radius_px, **streak)
 
 
-@pytest.mark.parametrize("kind", ["blur4", "blur8", "shadow", "hidden", "clean"])
+@pytest.mark.parametrize(
+    "kind", ["blur4", pytest.param("blur8", marks=pytest.mark.long), "shadow", "hidden", "clean"]
+)
 def test_markers_are_followed_where_another_renderer_draws_them(kind):
     errors = []
     for seed, (image, truth) in enumerate(other_pictures(kind)):

@@ -94,6 +94,7 @@ def test_the_guard_tells_the_servo_what_makes_the_angle_true():
     assert car.steered == [pytest.approx((0.3 - 0.02) / 0.93)]
 
 
+@pytest.mark.long
 def test_a_pilot_whose_sensors_are_off_believes_the_same():
     """As one whose sensors are not, at the same drive, and by the same program."""
     setup = make_setup()

@@ -121,7 +121,8 @@ def test_names_of_bases_and_gyros():
     assert float(equipped(car, "differential", "consumer").left_limit_mps) == 0
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("gyro-late", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["paper", "gyro-late"])
 def test_a_base_with_a_gyro_drives_and_turns(name):
     """By the truth: what is tested is the loop of plant, gyro, filter and controller."""
     base = equipped(worlds.qcar(), "differential", "consumer")

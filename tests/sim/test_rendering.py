@@ -485,6 +485,7 @@ def test_opencv_finds_the_right_marker_in_every_camera(room_renderer):
         assert np.abs(found_px - truth_px[index, index]).max() < 2.0
 
 
+@pytest.mark.long
 def test_the_seed_decides_everything(room_renderer):
     def drive(times_s):
         return np.stack([planar(0.1 + 0.4 * t, 0.0, 0.2 + 0.8 * t) for t in times_s])

@@ -28,7 +28,10 @@ from tests.reference.rigid import cayley, matrix, wxyz_xyz
 RIG, MARKERS, CAR = worlds.qcar_rig(), worlds.paper_markers(), worlds.qcar()
 VIEW = np.array(worlds.OVERLAP_VIEW)  # two cameras see the marker
 BANK, CHOOSES = MultiHypothesis(floor_m=0.0, floor_rad=0.0), LowestReprojection()
-SELECTORS = {"argvalues": [BANK, CHOOSES], "ids": ["bank", "choosing"]}
+SELECTORS = {
+    "argvalues": [BANK, pytest.param(CHOOSES, marks=pytest.mark.long)],
+    "ids": ["bank", "choosing"],
+}
 TINY = 1e-9
 ROOT = np.random.default_rng(5).normal(size=(6, 6))
 UNEVEN = {

@@ -161,6 +161,7 @@ def monte_carlo(room):
     }
 
 
+@pytest.mark.long
 def test_the_covariance_is_that_of_the_estimates(monte_carlo):
     errors, refined = monte_carlo["all"]
     assert np.all(refined.converged)

@@ -360,6 +360,7 @@ def by_value() -> Iterator[None]:
     cloudpickle.unregister_pickle_by_value(module)
 
 
+@pytest.mark.long
 def test_a_cluster_that_loses_a_worker_finds_the_same(tmp_path: Path, by_value: None) -> None:
     import psutil
 
@@ -398,6 +399,7 @@ def test_workers_that_die_for_good_are_one_line(tmp_path: Path, by_value: None) 
     assert store.count_done() == 0
 
 
+@pytest.mark.long
 def test_a_scheduler_that_goes_is_one_line(tmp_path: Path, by_value: None) -> None:
     study = Fake(config())
     study.slow_s = 0.2
@@ -469,6 +471,7 @@ def test_what_a_killed_process_has_left_of_a_new_store_is_swept(
     assert left == {".jaxnav-s1.zarr-x", ".jaxnav-else"}
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_study(tmp_path: Path) -> None:
     class Many(Fake):
         """As many trials as one likes, at once."""

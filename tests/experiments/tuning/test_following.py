@@ -267,6 +267,7 @@ def test_gradients_are_central_differences(loss):
     assert np.min(named) > 1e-5  # the floors are a tenth of a millimetre
 
 
+@pytest.mark.long
 def test_a_gyro_s_numbers_are_learned_by_their_gradients():
     """Of a base that drives, slips and stands: against central differences of what is predicted."""
     gyro = Gyro(2e-3, 0.02, 0.02, 30.0, 0.02, delay_sigma_s=0.02)

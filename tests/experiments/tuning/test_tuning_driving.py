@@ -238,6 +238,7 @@ def test_through_the_whole_navigator():
     assert np.all(np.isfinite(closed.value_and_grad(space.start, space, seeds)[1]))
 
 
+@pytest.mark.long
 def test_the_hard_losses_are_those_of_the_hard_controller(tame):
     """By the program that differentiates; a drive does not depend on their number."""
     short = dataclasses.replace(tame.rollout, scenario=scenario(duration_s=1.0), chunk_frames=5)

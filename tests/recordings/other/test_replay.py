@@ -121,6 +121,7 @@ def test_the_bank_halves_the_wrong_branches_and_smoothing_decides_the_others(
         np.testing.assert_allclose(*pose, atol=1e-12)
 
 
+@pytest.mark.long
 def test_poses_between_two_sightings_are_smoothed(test_7):
     """Where no marker is seen for a while, the track goes on, and ends where the next one says."""
     few, gap = test_7.first(64), slice(40, 43)
@@ -167,6 +168,7 @@ def test_a_replay_is_the_step_over_and_over(test_7):
     assert result.T_world_vehicle.shape == (CHUNK_FRAMES + 7, 1, 7)
 
 
+@pytest.mark.long
 def test_without_a_marker_the_pose_goes_on_by_the_odometry_alone(test_7):
     """Over 10 s, by an odometry in a frame of its own that turns 0.3 degrees a second too far."""
     begin, end = 60, 110
@@ -227,6 +229,7 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     assert len(list(tmp_path.glob("trajectory_marker_*.tum"))) == 9
 
 
+@pytest.mark.long
 def test_parameters_go_before_what_the_recording_tells(test_7, tmp_path, monkeypatch, capsys):
     short = test_7.first(20)
     monkeypatch.setattr("jaxnav.commands.drive.replay.read_recording", lambda *_: short)
