@@ -211,7 +211,7 @@ def _observations(recording: Recording, motions: _Motions, begin: int) -> Observ
     return _observed(recording.lanes(frames), fields)
 
 
-@jax.jit
+@kept
 @jax.vmap
 def _observed(lanes: tuple[Array, Array], fields: dict[str, Any]) -> Observation:
     return Observation(*lanes, **fields)
