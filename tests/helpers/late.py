@@ -20,7 +20,7 @@ from typing import Any
 EXIT_LATE = 70
 MAIN = "from tests.helpers.late import main; main()"
 _TELLING = ("/jax/core/compile/", "/jax/compilation_cache/", "/jaxnav/")  # how such events begin
-_UNWATCHED = "beside ROS"  # a new map is prepared there while the vehicle drives by the old one
+_UNWATCHED = "ROS service"  # it prepares a new map while the vehicle drives by the old one
 _CALLS = 12  # of a stack that are shown
 
 found: list[str] = []  # what came too late
