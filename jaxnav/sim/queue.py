@@ -26,7 +26,7 @@ from jaxnav.sim.traces import DriveTraces
 
 _POOL = 1024  # drives under way at once on a thread
 # So many drives don't pay for a second program, nor for a third.
-_ONE, _TWO = 32, 512
+_ONE, _TWO = 32, 256
 _ACCELERATOR_DRIVES = 2048
 
 
