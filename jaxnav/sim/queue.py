@@ -25,8 +25,8 @@ from jaxnav.core.navigator import Navigator
 from jaxnav.sim.traces import DriveTraces
 
 _POOL = 1024  # drives under way at once on a thread
-# So many drives don't pay for a second program, nor for a third.
-_ONE, _TWO = 32, 256
+# Up to so many drives don't pay for a second program, and for a third.
+_ONE_PROGRAM, _TWO_PROGRAMS = 32, 256
 _ACCELERATOR_DRIVES = 2048
 
 
@@ -87,10 +87,10 @@ def program_sizes(navigator: Navigator, drives: int) -> list[Slots]:
     if jax.default_backend() != "cpu":
         return [Slots(min(drives, _ACCELERATOR_DRIVES))]
     whole = Slots(min(drives, 16))
-    if drives <= _ONE or type(navigator) is not Navigator:
+    if drives <= _ONE_PROGRAM or type(navigator) is not Navigator:
         return [whole]
     if isinstance(navigator.selector, MultiHypothesis):
-        between = [Slots(32, 2, 8)] if drives > _TWO else []
+        between = [Slots(32, 2, 8)] if drives > _TWO_PROGRAMS else []
         return [Slots(64, 1, 2), *between, whole]
     several = navigator.no_candidates().valid.shape[0] > 2  # two candidates a sighting
     return [Slots(64, 1), whole] if several else [whole]

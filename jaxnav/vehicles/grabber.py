@@ -11,7 +11,7 @@ from collections.abc import Callable
 from jaxnav.drive.interfaces import Frame
 
 _PATIENCE_S = 0.5  # time that `close` waits for a hanging driver, before it abandons the thread
-_RETRY_S = 0.25  # after an error
+RETRY_S = 0.25  # after an error
 
 
 class NewestFrame:
@@ -95,10 +95,10 @@ class Grabber(NewestFrame):
             try:
                 frame = self._grab()
             except OSError as error:
-                failure, pause_s = error, _RETRY_S
+                failure, pause_s = error, RETRY_S
             except Exception as error:
                 # Drivers raise any exception; a thread that died of one would not report it.
-                failure, pause_s = OSError(f"{type(error).__name__}: {error}"), _RETRY_S
+                failure, pause_s = OSError(f"{type(error).__name__}: {error}"), RETRY_S
             self.add(frame, failure)
             if frame is None:
                 self._closing.wait(pause_s)

@@ -16,7 +16,7 @@ from jaxnav.drive.interfaces import AnyVehicle, Camera, Frame, GyroReading, HasT
 from jaxnav.drive.limits import limits_of
 from jaxnav.drive.standing_clock import WaitingClock
 from jaxnav.errors import BadInput
-from jaxnav.vehicles.grabber import NewestFrame
+from jaxnav.vehicles.grabber import RETRY_S, NewestFrame
 from jaxnav.vehicles.options import number, switch
 from jaxnav.vehicles.rendering_process import RenderingProcess, track_times_s
 from jaxnav.vehicles.world import SimWorld, WorldSettings
@@ -25,7 +25,6 @@ _LATENCY_NS = 20_000_000  # from the middle of an exposure until its corners are
 # The clock waits for frames that are later than this: a camera is stale after 0.2 s, and a process
 # that renders on a core of its own takes 0.05 to 0.1 s, without which the simulation is slow.
 _LATE_S = 0.12
-_RETRY_S = 0.25  # between errors, once the renderer is gone
 
 
 class SimVehicle:
@@ -121,7 +120,7 @@ class _Shutter:
             while not self._closed:
                 for camera in self.cameras:
                     camera.add(None, error)
-                time.sleep(_RETRY_S)
+                time.sleep(RETRY_S)  # the renderer is gone
 
     def _looked(self, stamp_ns: int) -> list[Frame]:
         if self._renderer is None:

@@ -146,7 +146,7 @@ def device(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
     monkeypatch.setattr(FakeCapture, "opened", [])
     monkeypatch.setattr(FakeCapture, "plugged", True)
-    monkeypatch.setattr("jaxnav.vehicles.grabber._RETRY_S", 0.1)
+    monkeypatch.setattr("jaxnav.vehicles.grabber.RETRY_S", 0.1)
     return FakeCapture
 
 
