@@ -386,6 +386,7 @@ def test_a_cluster_that_loses_a_worker_finds_the_same(tmp_path: Path, by_value: 
 
 def test_workers_that_die_for_good_are_one_line(tmp_path: Path, by_value: None) -> None:
     import dask
+    import distributed  # noqa: F401 - before `set`, whose end would take all its defaults away
 
     study = Fake(config())
     study.deadly = True
