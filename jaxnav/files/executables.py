@@ -126,14 +126,6 @@ def program(
     return _loaded(folder, name, inputs) or _compiled(bound, folder, name, given, inputs)
 
 
-def is_kept(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], folder: Path) -> bool:
-    """Whether `program` finds the executable in the folder."""
-    name, *_ = _asked(function, arguments, {})
-    with suppress(OSError, NotPrivateError):
-        return (private_folder(folder) / name).is_file()
-    return False
-
-
 @cache
 def sources_digest(package: Path, without: tuple[str, ...]) -> str:
     """The digest of a package's sources, some folders left out, as of the first call in a process:

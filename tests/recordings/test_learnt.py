@@ -70,6 +70,7 @@ def drive():
     return Learnt.from_errors(*errors_of(state.belief.bank), rig, vehicle), decided, seen
 
 
+@pytest.mark.long
 def test_a_drive_tells_how_a_camera_is_turned_and_what_the_wheels_read(drive):
     learnt, decided, seen = drive
     assert np.all(np.sum(seen, axis=0) > 50)
@@ -84,6 +85,7 @@ def test_a_drive_tells_how_a_camera_is_turned_and_what_the_wheels_read(drive):
     assert sigma < 0.01
 
 
+@pytest.mark.long
 def test_it_says_only_what_it_has_learnt(drive):
     learnt, _, _ = drive
     camera, wheels = learnt.sentences()

@@ -133,6 +133,7 @@ def test_errors_are_as_large_as_said_with_a_marker_now_and_then():
     assert np.median(ends_m) < 0.35  # after 2.5 s; without an IMU it is metres
 
 
+@pytest.mark.long
 def test_gravity_decides_for_a_body_at_rest_where_it_is_known():
     """3.5 m off at 1 px both poses of the marker, seen from above, fit; nothing moves for 4 s."""
     decided, wrong = {True: [], False: []}, []

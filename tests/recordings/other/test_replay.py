@@ -49,13 +49,12 @@ def run_banks_fast(monkeypatch):
     monkeypatch.setattr(localise, "smooth_frames", jit_to_run(smooth_frames.__wrapped__))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "frames", "selector", "median_m", "p95_m"),
     [
         ("test_5", 1200, "lowest-reprojection", 0.0029, 0.0125),  # of 2751
-        pytest.param(
-            *("test_7", 454, "multi-hypothesis", 0.0015, 0.0041), marks=pytest.mark.long
-        ),  # all of it
+        ("test_7", 454, "multi-hypothesis", 0.0015, 0.0041),  # all of it
     ],
 )
 def test_all_markers_locate_the_rig_to_millimetres(

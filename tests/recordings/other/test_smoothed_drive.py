@@ -10,6 +10,7 @@ from jaxnav.vehicles.conformance.lockstep import Rates, Step
 from tests.helpers.simulated import make_setup, simulated
 from tests.recordings.test_regression import FOLDER
 
+pytestmark = pytest.mark.long
 # Cameras see nothing in between.
 HIDDEN_S = (1.5, 2.5)
 
@@ -79,7 +80,6 @@ def test_it_is_known_as_well_as_it_says(tracks):
     assert np.all(np.abs(turn) < 3 * smoothed.sigma_rad)
 
 
-@pytest.mark.long
 def test_a_recorded_drive_is_smoothed_from_the_command_line(tmp_path, capsys):
     """Also where somebody carries the car off: two tracks, and none between them."""
     arguments = ["replay", FOLDER / "kidnapped.mcap", "--smooth", "--out", tmp_path, "--headless"]
