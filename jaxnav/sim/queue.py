@@ -26,7 +26,7 @@ from jaxnav.sim.traces import DriveTraces
 
 _POOL = 1024  # drives under way at once on a thread
 # Up to so many drives don't pay for a second program, and for a third.
-_ONE_PROGRAM, _TWO_PROGRAMS = 32, 256
+_ONE_PROGRAM, _TWO_PROGRAMS = 32, 512
 _ACCELERATOR_DRIVES = 2048
 
 
@@ -83,15 +83,18 @@ def program_sizes(navigator: Navigator, drives: int) -> list[Slots]:
 
     Nine frames of ten have one hypothesis alive, three of four show one sighting. A navigator with
     a step of its own, few drives, and an accelerator have one program.
+
+    Args:
+        drives: how many; one that carries P derivatives costs as much as 1 + P.
     """
     if jax.default_backend() != "cpu":
         return [Slots(min(drives, _ACCELERATOR_DRIVES))]
-    whole = Slots(min(drives, 16))
+    whole = Slots(min(drives, 8))
     if drives <= _ONE_PROGRAM or type(navigator) is not Navigator:
         return [whole]
     if isinstance(navigator.selector, MultiHypothesis):
-        between = [Slots(32, 2, 8)] if drives > _TWO_PROGRAMS else []
-        return [Slots(64, 1, 2), *between, whole]
+        least = [Slots(64, 1, 2)] if drives > _TWO_PROGRAMS else []
+        return [*least, Slots(16, 2, 5), whole]
     several = navigator.no_candidates().valid.shape[0] > 2  # two candidates a sighting
     return [Slots(64, 1), whole] if several else [whole]
 

@@ -73,7 +73,7 @@ class Rollout(eqx.Module):
     scenario: Scenario
     corner_noise_px: Float[Array, ""] = eqx.field(converter=jnp.asarray)
     spread: Spread | None = None  # None: all cars are nominal
-    chunk_frames: int = eqx.field(static=True, default=15)
+    chunk_frames: int = eqx.field(static=True, default=8)
 
     def run(
         self, keys: Key[Array, " S"], progress: Callable[[int], object] = lambda ended: None
@@ -110,7 +110,9 @@ class Rollout(eqx.Module):
             os.cpu_count() or 1,
             progress,
         )
-        (trace, further), own = traces.stack()
+        (trace, further), own = jax.tree.map(
+            lambda leaf: leaf[:, : self.scenario.frames], traces.stack()
+        )
         return eqx.tree_at(lambda t: t.active, trace, trace.active & own), further
 
     def start(self, keys: Key[Array, " S"]) -> DriveState:

@@ -105,7 +105,7 @@ class ClosedLoop(eqx.Module):
             keys,
             lambda keys: _start(self, x, space, jax.random.key_data(keys)),
             lambda drives, slots: _advance(self, x, space, drives, slots),
-            program_sizes(self.rollout.navigator, len(keys)),
+            program_sizes(self.rollout.navigator, len(keys) * (1 + len(x))),
             DriveTraces(len(keys), 1),
             os.cpu_count() or 1,
             progress,
