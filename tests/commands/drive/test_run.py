@@ -174,6 +174,7 @@ def test_images_of_any_map_end_no_drive(workplace, tmp_path, family, marker_id):
     }
 
 
+@pytest.mark.long
 def test_it_arrives_and_leaves_a_whole_recording(workplace, tmp_path):
     with driving(workplace, tmp_path) as drive:
         code, out, err = drive.ended()

@@ -177,6 +177,7 @@ def off_by_7_percent_and_2_degrees():
     return errors, jnp.asarray(np.tile(errors, (DRIVES, 1)))
 
 
+@pytest.mark.long
 def test_errors_that_are_as_large_as_told_leave_poses_as_far_off_as_they_say():
     errors = ERRORS.sigma[None] * jax.random.normal(jax.random.key(1), (DRIVES, 4))
     ((filtered, _), (both, _)), found, P = judged(MOTION, errors)

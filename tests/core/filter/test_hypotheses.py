@@ -530,6 +530,7 @@ def test_a_parked_car_whose_image_says_nothing_stays_undecided():
     assert np.mean(worse.flip_probability) > 0.1
 
 
+@pytest.mark.long
 def test_a_short_drive_across_decides_for_the_truth():
     """Two metres, of which the mirror image would have seen another side of the marker."""
     seen = run(car(), sensed(SIDEWAYS, 0.4))

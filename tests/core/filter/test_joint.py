@@ -74,6 +74,7 @@ def test_a_wall_of_markers_flips_and_says_how_probably(frames):
     assert np.mean(probability[pair]) == pytest.approx(np.mean(flipped[pair]), rel=0.15)
 
 
+@pytest.mark.long
 def test_markers_that_do_not_share_a_plane_leave_little_doubt(frames):
     flat, _, _ = frames(0.0, FEW)
     bent, flipped, pair = frames(np.deg2rad(35.0), FEW)

@@ -174,7 +174,9 @@ def at_zero() -> Driven:
         return Driven(ZERO)
 
 
-@pytest.fixture(scope="module", params=[EARTH_M, pytest.param(FAR_M, marks=pytest.mark.long)])
+@pytest.fixture(
+    scope="module", params=[pytest.param(far, marks=pytest.mark.long) for far in (EARTH_M, FAR_M)]
+)
 def away(request) -> Driven:
     with jax.enable_x64(False):
         return Driven(request.param)

@@ -199,6 +199,7 @@ def test_shorter_recordings_are_filled_with_frames_that_are_not_used():
     np.testing.assert_array_equal(both.rows(np.array([3])).used, both.used[3:4])
 
 
+@pytest.mark.long
 def test_it_starts_in_the_true_branch():
     found, poses = starts(), true_poses(recorded())[:, 0]
     assert np.all(found.chosen)
@@ -209,6 +210,7 @@ def test_it_starts_in_the_true_branch():
     np.testing.assert_array_equal(found.bank.mean[:, 0, 3:], 0)
 
 
+@pytest.mark.long
 def test_the_mirror_image_is_less_likely():
     """Followed as well, from as wide a start, and at the end of the drive still mirrored."""
     start, drive = first_of((starts().bank, recorded()))
