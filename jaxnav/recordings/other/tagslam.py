@@ -2,18 +2,24 @@
 
 cameras.yaml       intrinsics (Kalibr's keys), `tagtopic`, `rig_body`
 *.bag[.bz2]        detections; `/tf` with every camera, marker and the rig; `odom_topic`
-tagslam.yaml       sizes of the markers, and poses of the known ones; of the rig `odom_topic`, the
+tagslam.yaml       sizes of the markers, and poses of the known ones, also as boards; ids that
+                   stand for others for a while (`tag_id_remap`) and detections that are left out
+                   (`squash`, `ignore_tags`); of the rig `odom_topic`, the
                    odometry of other software, and `T_body_odom`, the pose of its body on the rig;
                    of ours `odom_delay_s`, how long before their stamps its poses were taken, and
                    `odom_sigma: {scale: 0.03, turn_deg: 1}`, how far off it may be
 camera_poses.yaml  poses of the cameras on the rig, where there is no /tf
+
+Markers on a body that moves are no landmarks, and left out of the map. Where all of them are on
+one that moves, it is the world: the reference is the rig's pose on it.
 """
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -38,6 +44,7 @@ from jaxnav.recordings.ros.odometry_track import OdometryTrack
 
 _FAMILY = "tag36h11"  # TagSLAM's default; its detections do not tell
 _TF_TYPES = ("tf/msg/tfMessage", "tf2_msgs/msg/TFMessage")
+_NOWHERE = np.array([1.0, 0, 0, 0, 0, 0, 0])  # the pose that moves nothing
 _Poses = dict[int, np.ndarray]  # stamp in ns -> (7,) wxyz xyz
 _Edges = dict[tuple[str, str], _Poses]  # (parent, child) -> the child's pose in the parent
 
@@ -162,15 +169,89 @@ class _TagEntry(ForeignEntry):
     pose: _PoseEntry | None = None
 
 
+_Lines = Annotated[int, Field(strict=True, ge=1, le=100)]
+
+
+class _BoardEntry(ForeignEntry):
+    """Tags in rows, all alike, numbered row by row, with gaps as shares of their size."""
+
+    tag_start_id: Count
+    tag_size: Size
+    tag_spacing: Annotated[Number, within("spacing")]
+    tag_rows: _Lines
+    tag_columns: _Lines
+    pose: _PoseEntry | None = None  # of the body on the board
+
+    def tags(self, staggered: bool) -> dict[int, "_Tag"]:
+        """The tags by their ids. A staggered board has every second place, and its rows go down."""
+        step_m = self.tag_size * (1 + self.tag_spacing)
+        T_body_board = poses.inverse(_NOWHERE if self.pose is None else self.pose.pose())
+        places = [
+            (column * step_m, (-row if staggered else row) * step_m)
+            for row in range(self.tag_rows)
+            for column in range(row % 2 if staggered else 0, self.tag_columns, 1 + staggered)
+        ]
+        return {
+            self.tag_start_id + index: _Tag(
+                self.tag_size, poses.compose(T_body_board, np.array([1, 0, 0, 0, x_m, y_m, 0.0]))
+            )
+            for index, (x_m, y_m) in enumerate(places)
+        }
+
+
+class _Tag(NamedTuple):
+    """What is written of a tag."""
+
+    size_m: float | None
+    T_body_tag: np.ndarray | None  # (7,)
+
+
 class _BodyEntry(ForeignEntry):
     is_static: bool = True
     default_tag_size: Size | None = None
     pose: _PoseEntry | None = None
     tags: list[_TagEntry] = Field(default_factory=list)
+    board: _BoardEntry | None = None
+    staggered_board: _BoardEntry | None = None
+    ignore_tags: list[Count] = Field(default_factory=list)
     odom_topic: Text | None = None
     T_body_odom: _PoseEntry | None = None
     odom_delay_s: Annotated[Number, within("delay_s")] = 0.0
     odom_sigma: OdometrySigma = OdometrySigma()
+
+    def by_id(self) -> dict[int, _Tag]:
+        """The tags that are on it, by their ids."""
+        boards = (self.board, False), (self.staggered_board, True)
+        return {
+            tag.id: _Tag(tag.size, None if tag.pose is None else tag.pose.pose())
+            for tag in self.tags
+        } | {
+            tag_id: tag
+            for board, staggered in boards if board is not None
+            for tag_id, tag in board.tags(staggered).items()
+        }  # fmt: skip
+
+
+_Stamp = Annotated[Decimal, Field(ge=0, le=2**33)]  # s; a text keeps all of its digits
+_STAMP_TOLERANCE_NS = 1000  # a float has 200
+
+
+class _RemapEntry(ForeignEntry):
+    remap_id: Count
+    camera: str = ""  # every one
+    start_time: _Stamp
+    end_time: _Stamp
+
+
+class _RemapsEntry(ForeignEntry):
+    id: Count
+    remaps: list[_RemapEntry]
+
+
+class _SquashEntry(ForeignEntry):
+    tags: list[Count]
+    time: _Stamp = Decimal(0)  # 0: at all times, in the camera
+    camera: str = ""
 
 
 class TagSlamFile(ForeignEntry):
@@ -178,10 +259,44 @@ class TagSlamFile(ForeignEntry):
 
     default_body: str | None = None
     bodies: Annotated[list[dict[str, _BodyEntry]], Field(min_length=1)]
+    tag_id_remap: list[_RemapsEntry] = Field(default_factory=list)
+    squash: list[_SquashEntry] = Field(default_factory=list)
 
     def by_name(self) -> dict[str, _BodyEntry]:
         """The bodies by their names."""
         return {name: entry for body in self.bodies for name, entry in body.items()}
+
+    def applied(self, rows: Rows, cameras: Sequence[str]) -> Rows:
+        """Detections less those that the file leaves out, and under the ids that it gives them.
+
+        Args:
+            cameras: their names, in the order of the rig.
+        """
+        stamps_ns, camera = rows.stamps_ns, np.array(cameras)[rows.cameras]
+
+        def during(begin_s: Decimal, end_s: Decimal) -> np.ndarray:
+            begin_ns, end_ns = (int(stamp_s * 10**9) for stamp_s in (begin_s, end_s))
+            after = stamps_ns >= begin_ns - _STAMP_TOLERANCE_NS
+            return np.asarray(after & (stamps_ns <= end_ns + _STAMP_TOLERANCE_NS))
+
+        ignored = [tag for body in self.by_name().values() for tag in body.ignore_tags]
+        left_out = np.isin(rows.ids, ignored)
+        for squash in self.squash:
+            there = during(squash.time, squash.time) if squash.time else camera == squash.camera
+            left_out |= there & np.isin(rows.ids, squash.tags)
+        ids = rows.ids.copy()
+        for known in self.tag_id_remap:
+            for one in known.remaps:
+                there = during(one.start_time, one.end_time) & (rows.ids == known.id)
+                ids[there & ((camera == one.camera) | (one.camera == ""))] = one.remap_id
+        kept = ~left_out
+        return replace(
+            rows,
+            stamps_ns=stamps_ns[kept],
+            cameras=rows.cameras[kept],
+            ids=ids[kept],
+            corners_px=rows.corners_px[kept],
+        )
 
 
 class _CameraPoseEntry(ForeignEntry):
@@ -213,16 +328,18 @@ def read_tagslam(path: Path, rig: CameraRig | None) -> Source:
         found = [bag.frames for bag in recorded]
         cameras.append(_only(found, entry.tagtopic, TAGSLAM, where, recorded))
     edges = {edge: stamped for bag in recorded for edge, stamped in bag.transforms.items()}
+    rows = _rows(cameras)
+    rows = rows if settings is None else settings.applied(rows, list(chain))
     rig = rig or _rig(path, chain, edges, body)
     if len(rig) != len(chain):
         problem = f"has {len(rig)} cameras, but {path / 'cameras.yaml'} has {len(chain)}"
         raise BadInput("--rig", problem)
     return Source(
         path.name,
-        _rows(cameras),
+        rows,
         rig,
-        lambda: _markers(file, settings, edges),
-        lambda: _reference(edges, body),
+        lambda: _markers(file, settings, edges, body),
+        lambda: _reference(edges, body, _world(file, settings, edges, body)),
         None if moves is None else _odometry(file, body, moves, recorded),
     )
 
@@ -238,12 +355,23 @@ def _only(
     return found[0]
 
 
-def _reference(edges: _Edges, body: str) -> _Poses | None:
-    reference = {
-        stamp: _canonical(pose)
-        for (_, child), stamped in edges.items() if child == body
-        for stamp, pose in stamped.items()
-    }  # fmt: skip
+def _reference(edges: _Edges, body: str, world: str | None) -> _Poses | None:
+    """The poses of the rig in the world, which may be a body that moves."""
+
+    def of(name: str) -> _Poses:
+        return {
+            stamp: _canonical(pose)
+            for (_, child), stamped in edges.items() if child == name
+            for stamp, pose in stamped.items()
+        }  # fmt: skip
+
+    reference = of(body)
+    if world is not None:
+        moves, last = of(world), max(reference, default=0)
+        reference = {
+            stamp: poses.compose(poses.inverse(pose), reference.get(stamp, reference[last]))
+            for stamp, pose in moves.items() if stamp in reference or len(reference) == 1
+        }  # fmt: skip
     return reference or None
 
 
@@ -282,22 +410,52 @@ def _rig(path: Path, chain: dict[str, kalibr.KalibrCamera], edges: _Edges, body:
     return rig_of(cameras)
 
 
-def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges) -> MarkerMap:
-    """The map: poses from /tf, or else known ones of tagslam.yaml; sizes from tagslam.yaml."""
-    settings = settings or validate(TagSlamFile, read_mapping(file), file)  # it is not there
-    bodies = settings.by_name()
-    entry_of = {(name, tag.id): tag for name, body in bodies.items() for tag in body.tags}
-    Ts_world_marker: dict[int, tuple[str, np.ndarray]] = {}
-    parents = {child: (parent, stamped) for (parent, child), stamped in edges.items()}
+def _tagged(edges: _Edges) -> dict[int, tuple[str, str]]:
+    """The body that each marker of /tf is on, and the marker's frame, by the marker's id."""
+    holders = {}
     for parent, child in edges:
         number = child.removeprefix("tag_")
         if number != child and re.fullmatch("[0-9]{1,9}", number):
-            Ts_world_marker[int(number)] = (parent, _to_root(child, parents))
-    if not Ts_world_marker:
-        for (name, tag_id), tag in entry_of.items():
-            body = bodies[name]
-            if tag.pose is not None and body.pose is not None and body.is_static:
-                T_world_marker = poses.compose(body.pose.pose(), tag.pose.pose())
+            holders[int(number)] = (parent, child)
+    return holders
+
+
+def _world(file: Path, settings: TagSlamFile | None, edges: _Edges, rig_body: str) -> str | None:
+    """The body that all known markers are on, where that one moves; None: some of them stand."""
+    bodies = {} if settings is None else settings.by_name()
+    holders = {holder for holder, _ in _tagged(edges).values()} or {
+        name
+        for name, body in bodies.items()
+        if any(tag.T_body_tag is not None for tag in body.by_id().values())
+    }
+    moving = {name for name in holders if name in bodies and not bodies[name].is_static}
+    if holders - moving:
+        return None
+    moving -= {rig_body}
+    if len(moving) > 1:
+        several = ", ".join(sorted(moving))
+        raise BadInput(at(file, "bodies"), f"all tags are on several bodies that move: {several}")
+    return next(iter(moving), None)
+
+
+def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges, rig_body: str) -> MarkerMap:
+    """The map: poses from /tf, or else known ones of tagslam.yaml; sizes from tagslam.yaml."""
+    settings = settings or validate(TagSlamFile, read_mapping(file), file)  # it is not there
+    bodies = settings.by_name()
+    world = _world(file, settings, edges, rig_body)
+    stands = {name for name, body in bodies.items() if body.is_static or name == world}
+    Ts_world_marker: dict[int, tuple[str, np.ndarray]] = {}
+    parents = {child: (parent, stamped) for (parent, child), stamped in edges.items()}
+    tagged = _tagged(edges)
+    for tag_id, (parent, frame) in tagged.items():
+        if parent in stands or parent not in bodies:
+            Ts_world_marker[tag_id] = (parent, _to_root(frame, parents, world))
+    for name in stands if not tagged else ():
+        body = bodies[name]
+        for tag_id, tag in body.by_id().items():
+            if tag.T_body_tag is not None and (name == world or body.pose is not None):
+                T_world_body = body.pose.pose() if body.pose is not None else _NOWHERE
+                T_world_marker = poses.compose(T_world_body, tag.T_body_tag)
                 Ts_world_marker[tag_id] = (name, T_world_marker)
     if not Ts_world_marker:
         problem = "has no static body with a tag of known pose, and no /tf has tags"
@@ -306,9 +464,9 @@ def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges) -> MarkerM
     sizes_m = []
     for tag_id in ids:
         name = Ts_world_marker[tag_id][0]
-        tag_entry = entry_of.get((name, tag_id))
         holder = bodies.get(name) or bodies.get(settings.default_body or "")
-        size_m = (tag_entry and tag_entry.size) or (holder and holder.default_tag_size)
+        own = holder and holder.by_id().get(tag_id)
+        size_m = (own and own.size_m) or (holder and holder.default_tag_size)
         if not size_m:
             raise BadInput(
                 at(file, f"bodies.{name}.default_tag_size"), f"missing, for tag {tag_id}"
@@ -318,10 +476,10 @@ def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges) -> MarkerM
     return marker_map(stacked, sizes_m, ids, [_FAMILY] * len(ids))
 
 
-def _to_root(frame: str, parents: dict[str, tuple[str, _Poses]]) -> np.ndarray:
+def _to_root(frame: str, parents: dict[str, tuple[str, _Poses]], root: str | None) -> np.ndarray:
     T_root_frame = np.eye(4)
-    seen = set()
-    while frame in parents and frame not in seen:
+    seen: set[str] = set()
+    while frame in parents and frame not in {*seen, root}:
         seen.add(frame)
         frame, stamped = parents[frame]
         T_root_frame = poses.matrix(_last(stamped)) @ T_root_frame

@@ -249,6 +249,102 @@ def test_a_folder_with_transforms_takes_its_poses_from_them(folder):
     np.testing.assert_allclose(read.reference.T_world_vehicle, [[*UNIT, 7, 8, 9]], atol=1e-12)
 
 
+def test_tags_that_stand_for_others_are_renamed_and_some_left_out(folder):
+    """For a while, in one camera; a squashed time is a text, which keeps its digits."""
+    path, at_ns = folder / "tagslam.yaml", 1_527_206_556_891_942_748
+    path.write_text(
+        path.read_text().replace(
+            "default_tag_size: 0.5", "default_tag_size: 0.5\n     ignore_tags: [8]"
+        )
+        + "tag_id_remap: [{id: 7, remaps: ["
+        "{remap_id: 3, start_time: 1527206556.5, end_time: 1527206557.0},"
+        " {remap_id: 3, camera: cam9, start_time: 0, end_time: 1527206556.0}]}]\n"
+        f"squash: [{{time: '{at_ns // 10**9}.{at_ns % 10**9}', tags: [3]}},"
+        " {camera: cam9, tags: [3]}]\n"
+    )
+    early_ns, late_ns = at_ns - 10**9, at_ns + 10**6
+    tags = [(tag, SQUARE_PX + 9 * tag) for tag in (3, 7, 8)]
+    (folder / "seen.bag").unlink()
+    seen = [(early_ns, tags), (at_ns, tags), (late_ns, tags[1:])]
+    write_bag(folder / "seen.bag", {"/a/tags": seen})
+    read = read_recording(folder)
+    np.testing.assert_array_equal(read.visible[:, 0, 0], [True, True, True])
+    shift_px = read.corners_px[:, 0, 0, 0, 0] - SQUARE_PX[:, 0].min()
+    np.testing.assert_array_equal(shift_px, [27, 63, 63])  # id 3, then id 7 in its place
+    assert read.unmapped_detections == 1  # id 7 early; id 8 is nowhere
+    path.write_text(path.read_text().replace("end_time: 1527206557.0", "end_time: late"))
+    assert f"{path}: tag_id_remap[0].remaps[0].end_time: " in refused(folder)
+
+
+BOARD = """
+bodies:
+ - sheet:
+     is_static: true
+     type: KIND
+     pose: {position: {x: 5, y: 0, z: 0}, rotation: {x: 0, y: 0, z: 0}}
+     KIND: {tag_start_id: 12, tag_size: 0.1, tag_spacing: 0.5, tag_rows: 2, tag_columns: 3}
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "places_m"),
+    [
+        ("board", [(0, 0), (0.15, 0), (0.3, 0), (0, 0.15), (0.15, 0.15), (0.3, 0.15)]),
+        ("staggered_board", [(0, 0), (0.3, 0), (0.15, -0.15)]),
+    ],
+)
+def test_a_board_is_its_tags(folder, kind, places_m):
+    """As TagSLAM lays them out, each of the board's size."""
+    path = folder / "tagslam.yaml"
+    path.write_text(BOARD.replace("KIND", kind))
+    markers = read_recording(folder).markers
+    assert markers.ids == tuple(range(12, 12 + len(places_m)))
+    expected_m = [(x_m + 5, y_m, 0.0) for x_m, y_m in places_m]
+    np.testing.assert_allclose(markers.Ts_world_marker.translation(), expected_m, atol=1e-12)
+    np.testing.assert_allclose(markers.size_m, 0.1)
+
+
+def pose_at(x_m: float, yaw_rad: float) -> tuple[float, ...]:
+    return (np.cos(yaw_rad / 2), 0, 0, np.sin(yaw_rad / 2), x_m, 0, 0)
+
+
+def moving(folder: Path, *standing: Any) -> Recording:
+    """The rig and the wall both move; the wall has tag 3, a metre before it."""
+    path = folder / "tagslam.yaml"
+    path.write_text(
+        path.read_text().replace("wall:\n     is_static: true", "wall:\n     is_static: false")
+    )
+    seen = [(stamp, [(3, SQUARE_PX), (4, SQUARE_PX + 40)]) for stamp in (5, 6, 7)]
+    bag = Bag("bag")
+    for stamp, tags in seen:
+        bag.tagslam("/a/tags", stamp, stamp, tags)
+    bag.transform(5, "wall", "tag_3", pose_at(1.0, 0.0))
+    bag.transform(5, "cart", "cam0", pose_at(0.0, 0.0))
+    for edge in standing:
+        bag.transform(5, *edge)
+    for index, stamp in enumerate((5, 6, 7)):
+        bag.transform(stamp, "map", "wall", pose_at(10.0 * index, 0.3 * index))
+        bag.transform(stamp, "map", "cart", pose_at(10.0 * index, 0.3 * index + 0.1))
+    (folder / "seen.bag").unlink()
+    bag.write(folder).rename(folder / "seen.bag")
+    return read_recording(folder)
+
+
+def test_a_body_that_moves_with_all_tags_is_the_world(folder):
+    read = moving(folder)
+    assert read.markers.ids == (3,)
+    np.testing.assert_allclose(read.markers.Ts_world_marker.translation(), [[1.0, 0, 0]], atol=1e-9)
+    expected = np.tile(pose_at(0.0, 0.1), (3, 1))
+    np.testing.assert_allclose(read.reference.T_world_vehicle, expected, atol=1e-9)
+
+
+def test_tags_on_a_body_that_moves_are_no_landmarks(folder):
+    read = moving(folder, ("map", "tag_4", pose_at(2.0, 0.0)))
+    assert (read.markers.ids, read.unmapped_detections) == ((4,), 3)
+    np.testing.assert_allclose(read.markers.Ts_world_marker.translation(), [[2.0, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(read.reference.T_world_vehicle[:, 4], [0, 10, 20], atol=1e-9)
+
+
 ODOMETRY = """
  - cart:
      is_static: false
