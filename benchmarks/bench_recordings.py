@@ -29,38 +29,27 @@ from jaxnav.core.filter.selectors import make_selector  # noqa: E402
 from jaxnav.core.models.vehicle import default_odometry_sigma  # noqa: E402
 from jaxnav.files.poses import matrix, pose_from_matrix  # noqa: E402
 from jaxnav.recordings.other.recordings import Recording, read_recording  # noqa: E402
-from jaxnav.recordings.other.replay import Replay, errors, replay  # noqa: E402
+from jaxnav.recordings.other.replay import Replay, errors, replay, scores  # noqa: E402
 from jaxnav.recordings.ros.odometry_track import OdometryTrack  # noqa: E402
 
 DATA = Path(os.environ.get("JAXNAV_DATA", Path(__file__).parents[2] / "shared/data")) / "tagslam"
-CLAIM = 1e-3  # a flip probability below it is a claim to be sure
-# The log score of a probability of 0 that is wrong is infinite: none is taken for less than this.
-LEAST_PROBABILITY = 1e-6
 
 
 def score(recording: Recording, result: Replay) -> dict[str, float]:
-    """The shares of wrong poses and of claims, the log score, and ANEES, of one replay."""
+    """The cells of a row."""
     assert recording.reference is not None
-    judged = result.seen & recording.reference.valid[:, None]
-    wrong = np.asarray(result.branch.wrong)[judged]
-    outlier = np.asarray(result.branch.outlier)[judged]
-    doubt = result.flip_probability[judged]
-    claimed = (doubt < CLAIM) & result.decided[judged]
-    probability = np.clip(doubt, LEAST_PROBABILITY, 1 - LEAST_PROBABILITY)[~outlier]
-    log_score = -np.where(wrong[~outlier], np.log(probability), np.log1p(-probability))
-    nees = result.nees[judged & result.located]
+    known = scores(result, recording)
     position_m, rotation_deg = (error[np.isfinite(error)] for error in errors(result, recording))
-    constant = max(float(np.mean(wrong[~outlier])), 1e-12)
     return {
-        "poses": len(wrong),
-        "wrong %": 100 * np.mean(wrong),
-        "outliers %": 100 * np.mean(outlier),
-        "claimed %": 100 * np.mean(claimed),
-        "wrong of those %": 100 * np.mean(wrong[claimed]) if claimed.any() else np.nan,
-        "log score": float(np.mean(log_score)),
-        "of a constant": -(constant * np.log(constant) + (1 - constant) * np.log1p(-constant)),
-        "ANEES": float(np.mean(nees)),
-        "NEES median": float(np.median(nees)),
+        "poses": int((result.seen & recording.reference.valid[:, None]).sum()),
+        "wrong %": 100 * known["wrong"],
+        "outliers %": 100 * known["outlier"],
+        "claimed %": 100 * known["claimed"],
+        "wrong of those %": 100 * known["wrong_of_claimed"],
+        "log score": known["log_score"],
+        "of a constant": known["log_score_of_a_constant"],
+        "ANEES": known["anees"],
+        "NEES median": known["nees_median"],
         "mm": 1e3 * float(np.median(position_m)),
         "mm, 95 %": 1e3 * float(np.percentile(position_m, 95)),
         "deg": float(np.median(rotation_deg)),
@@ -202,6 +191,7 @@ def main() -> None:
     )
     parser.add_argument("names", nargs="*", help="folders of tagslam; all of them by default")
     parser.add_argument("--frames", type=int, default=3000, help="at most so many of each")
+    parser.add_argument("--every", type=int, default=1, help="every 2nd, 5th ... frame alone")
     parser.add_argument(
         "--selectors", nargs="*", default=["lowest-reprojection", "multi-hypothesis"]
     )
@@ -225,7 +215,7 @@ def main() -> None:
     for folder in sorted(DATA.glob("test_*"), key=lambda path: int(path.name[5:])):
         if args.names and folder.name not in args.names:
             continue
-        recording = read_recording(folder).first(args.frames)
+        recording = read_recording(folder).every(args.every).first(args.frames)
         if args.markers is not None:
             recording = of_most_seen(recording, args.markers)
         if args.without_odometry:

@@ -4,6 +4,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxnav.commands.bars import progress_bar, update_after_compiling
 from jaxnav.commands.drive import replay_drive
@@ -16,8 +17,17 @@ from jaxnav.core.filter.selectors import make_selector
 from jaxnav.core.navigator import Navigator
 from jaxnav.errors import BadInput, visible
 from jaxnav.files import apply_params, output_folder, write_tum
+from jaxnav.files.writing import atomic_write
 from jaxnav.recordings.other.recordings import Recording, read_recording
-from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, motion_of, replay
+from jaxnav.recordings.other.replay import (
+    Replay,
+    errors,
+    explain_outliers,
+    frames_in_view,
+    motion_of,
+    replay,
+    scores,
+)
 from jaxnav.recordings.ros.odometry_track import odometry_delay
 
 if TYPE_CHECKING:
@@ -25,6 +35,8 @@ if TYPE_CHECKING:
 
 _DEFAULT_SELECTOR: Selector = "multi-hypothesis"
 _SETTLED_FRAMES = 5  # of a marker in view; a choice made later can use a history
+_MANY_OUTLIERS = 0.2  # poses
+_POSE_COLUMNS = "qw", "qx", "qy", "qz", "x_m", "y_m", "z_m"
 
 
 def run(args: Arguments) -> int:
@@ -62,7 +74,10 @@ def run(args: Arguments) -> int:
         )
     summary = _summary(args, recording, result)
     _write_tracks(args, recording, result)
+    _write_detections(args, recording, result)
     lines = [_text(summary)]
+    if summary.get("outlier_fraction", 0) > _MANY_OUTLIERS:
+        lines.append(explain_outliers(recording))
     if recording.odometry is not None:
         track = int(np.argmax(result.seen.sum(axis=0)))  # the one that sees most
         poses, seen = result.T_world_vehicle[:, track], result.seen[:, track]
@@ -106,18 +121,19 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
     position_m, rotation_deg = errors(result, recording)
     judged = result.seen & recording.reference.valid[:, None]
     settled = judged & (frames_in_view(result.seen) > _SETTLED_FRAMES)
-    wrong, outlier = np.asarray(result.branch.wrong), np.asarray(result.branch.outlier)
-
-    def fraction(of: np.ndarray, among: np.ndarray) -> float:
-        return float((of & among).sum()) / max(int(among.sum()), 1)
-
+    late = (np.asarray(result.branch.wrong) & settled).sum() / max(int(settled.sum()), 1)
+    known = scores(result, recording)
     return {
         "poses_with_reference": int(judged.sum()),
-        "position_error_m": _spread(position_m),
+        "position_error_m": _spread(position_m) | {"rms": known["position_rms_m"]},
         "rotation_error_deg": _spread(rotation_deg),
-        "wrong_branch_fraction": fraction(wrong, judged),
-        f"wrong_branch_fraction_after_{_SETTLED_FRAMES}_frames": fraction(wrong, settled),
-        "outlier_fraction": fraction(outlier, judged),
+        "wrong_branch_fraction": known["wrong"],
+        f"wrong_branch_fraction_after_{_SETTLED_FRAMES}_frames": float(late),
+        "outlier_fraction": known["outlier"],
+        "decided_fraction": known["decided"],
+        "claimed_fraction": known["claimed"],
+        "wrong_of_claimed_fraction": known["wrong_of_claimed"],
+        **{name: known[name] for name in ("log_score", "log_score_of_a_constant", "anees")},
     }
 
 
@@ -142,6 +158,51 @@ def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None
         write_tum(
             args.out / "reference.tum", stamps_s[valid], recording.reference.T_world_vehicle[valid]
         )
+
+
+def _write_detections(args: Arguments, recording: Recording, result: Replay) -> None:
+    """Write what was seen, a line each, and what was made of it: for who wants to count again."""
+    frame, camera, marker = recording.seen_at
+    track = marker if args.one_at_a_time else np.zeros_like(marker)
+    row = np.full(result.seen.shape, -1)
+    row[result.seen] = np.arange(len(result.selected))
+    used = row[frame, track] >= 0  # nothing is where the marker can be none
+    frame, camera, marker, track = (each[used] for each in (frame, camera, marker, track))
+    rows, poses = row[frame, track], result.T_world_vehicle[frame, track]
+    turned = Rotation.from_quat(poses[:, :4], scalar_first=True)
+    in_vehicle_m = np.asarray(recording.rig.Ts_camera_vehicle.inverse().translation())[camera]
+    Ts_world_marker = recording.markers.Ts_world_marker
+    to_camera = poses[:, 4:] + turned.apply(in_vehicle_m)
+    to_camera -= np.asarray(Ts_world_marker.translation())[marker] + recording.markers.origin_m
+    normal = np.asarray(Ts_world_marker.rotation().as_matrix())[marker, :, 2]
+    cosine = np.sum(normal * to_camera, axis=1) / np.linalg.norm(to_camera, axis=1)
+    columns = {
+        "frame": frame,
+        "stamp_ns": recording.stamps_ns[frame],
+        "camera": np.array(recording.rig.names)[camera],
+        "id": np.array(recording.markers.ids)[marker],
+        "view_deg": np.rad2deg(np.arccos(np.clip(cosine, -1, 1))),
+        "chosen": result.selected[rows],
+        "flip_probability": result.flip_probability[frame, track],
+        "decided": result.decided[frame, track].astype(int),
+    }
+    if recording.reference is not None:
+        position_m, rotation_deg = errors(result, recording)
+        columns |= {
+            "nees": result.nees[frame, track],
+            "position_error_m": position_m[frame, track],
+            "rotation_error_deg": rotation_deg[frame, track],
+        }
+    candidates = enumerate(np.moveaxis(result.candidates[rows], 1, 0))
+    named = {"reported": poses} | {f"candidate_{number}": pose for number, pose in candidates}
+    for name, pose in named.items():
+        columns |= {f"{name}_{axis}": pose[:, n] for n, axis in enumerate(_POSE_COLUMNS)}
+    lines = [",".join(columns)]
+    lines += [
+        ",".join(f"{cell:.9g}" if isinstance(cell, float) else str(cell) for cell in line)
+        for line in zip(*(column.tolist() for column in columns.values()), strict=True)
+    ]
+    atomic_write(args.out / "detections.csv", "\n".join(lines) + "\n")
 
 
 def _picture(recording: Recording, result: Replay, title: str) -> "Figure":

@@ -347,13 +347,15 @@ def _normals_error(T_vehicle_world: jaxlie.SE3, snapshot: Snapshot) -> Float[Arr
 
 
 OUTLIER_DEG = 10.0
+SAME_BRANCH_DEG = 3.0  # candidates that are nearer to each other count as one
 
 
 class Branch(eqx.Module):
     """Verdict on one choice of a candidate. At most one of `wrong` and `outlier` is True."""
 
     judged: Bool[Array, ""]  # a candidate was taken
-    wrong: Bool[Array, ""]  # another candidate is closer to the truth in angle, by `EVEN_RAD`
+    # Another candidate, more than `SAME_BRANCH_DEG` away, is closer to the truth in angle.
+    wrong: Bool[Array, ""]
     outlier: Bool[Array, ""]  # no candidate lies within 10 degrees of the truth
     ambiguous: Bool[Array, ""]  # there was more than one candidate
 
@@ -361,7 +363,7 @@ class Branch(eqx.Module):
 def judge_branch(
     candidates: Candidates, selected: Int[Array, ""], T_world_vehicle_true: jaxlie.SE3
 ) -> Branch:
-    """Whether the selected candidate is the one nearest to the truth in angle.
+    """Whether the selected candidate is the one nearest to the truth in angle, or next to it.
 
     Args:
         candidates: N poses of one observation.
@@ -372,11 +374,16 @@ def judge_branch(
         lambda T_vehicle_world: rotation_error_rad(T_vehicle_world.inverse(), T_world_vehicle_true)
     )(candidates.T_vehicle_world)
     angles_rad = jnp.where(candidates.valid, angles_rad, jnp.inf)
-    nearest_rad = jnp.min(angles_rad)
+    nearest_rad, chosen = jnp.min(angles_rad), jnp.maximum(selected, 0)
+    nearest = jnp.argmin(angles_rad)
+    of_chosen, of_nearest = (
+        jax.tree.map(lambda leaf: leaf[index], candidates.T_vehicle_world)  # noqa: B023
+        for index in (chosen, nearest)
+    )
+    is_other = rotation_error_rad(of_chosen, of_nearest) > jnp.deg2rad(SAME_BRANCH_DEG)
     judged = selected >= 0
     outlier = judged & (nearest_rad > jnp.deg2rad(OUTLIER_DEG))
-    off_rad = angles_rad[jnp.maximum(selected, 0)]
-    wrong = judged & ~outlier & (off_rad > nearest_rad + EVEN_RAD)
+    wrong = judged & ~outlier & is_other & (angles_rad[chosen] > nearest_rad + EVEN_RAD)
     return Branch(judged, wrong, outlier, judged & (jnp.sum(candidates.valid) > 1))
 
 

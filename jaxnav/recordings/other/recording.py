@@ -109,13 +109,23 @@ class Recording:
 
     def first(self, frames: int) -> "Recording":
         """The recording cut to its first frames."""
-        kept = np.searchsorted(self.seen_at[0], frames)
+        return self._only(np.arange(min(frames, len(self))))
+
+    def every(self, step: int) -> "Recording":
+        """The recording as a camera would have taken it that is so many times slower."""
+        return self._only(np.arange(0, len(self), step))
+
+    def _only(self, frames: Int[np.ndarray, " K"]) -> "Recording":
+        number = np.full(len(self), -1)
+        number[frames] = np.arange(len(frames))
+        kept = number[self.seen_at[0]] >= 0
+        frame, *rest = self.seen_at[:, kept]
         return replace(
             self,
-            stamps_ns=self.stamps_ns[:frames],
-            seen_at=self.seen_at[:, :kept],
-            seen_px=self.seen_px[:kept],
-            reference=self.reference and Reference(*(rows[:frames] for rows in self.reference)),
+            stamps_ns=self.stamps_ns[frames],
+            seen_at=np.stack([number[frame], *rest]),
+            seen_px=self.seen_px[kept],
+            reference=self.reference and Reference(*(rows[frames] for rows in self.reference)),
         )
 
 

@@ -41,6 +41,12 @@ from jaxnav.recordings.other.localise import (
 from jaxnav.recordings.other.recording import Recording
 from jaxnav.recordings.ros.body import MAX_DT_S
 
+CLAIM = 1e-3  # a decided pose with a smaller flip probability claims to be right
+# The log score of a probability of 0 that is wrong is infinite: none counts as less than this.
+_LEAST_PROBABILITY = 1e-6
+_MISFIT_SHARE = 0.25  # of a marker's side in the image
+_MISFIT_FRAMES = 64  # in which map and reference are held against the corners
+_IDS = 8  # that are listed
 SIGMA_SAMPLES = 512  # detections from which the scatter of a recording's corners is estimated
 
 
@@ -55,6 +61,10 @@ class Replay:
     flip_probability: Float[np.ndarray, "F tracks"]
     nees: Float[np.ndarray, "F tracks"]  # of the pose, 6 dof; meaningless without a reference
     branch: Branch  # leaves (F, tracks); meaningless where there is no reference
+    # Where a track is `seen`, in the order of `np.nonzero`: every pose that its corners may mean,
+    # wxyz xyz, NaN where there are fewer than N; and which of them is nearest to the reported pose.
+    candidates: Float[np.ndarray, "S N 7"]
+    selected: Int[np.ndarray, " S"]
     frames_per_second: float  # without the first chunk, which is compiled, unless it is alone
     corner_sigma_px: float  # the filter's
     filtered: "Replay | None" = None  # of a smoothed one: as each pose was known at its own time
@@ -111,19 +121,31 @@ def replay(
         one_at_a_time,
         smooth,
     ):
-        chunks.append(jax.device_get(_judge_all(poses, _truth(recording, begin))))
+        chunks.append(_without_padding(_judge_all(poses, _truth(recording, begin)), total - begin))
         clock_s.append(time.perf_counter())
         progress(min(CHUNK_FRAMES, total - begin))
     count = -(-total // CHUNK_FRAMES)
     compiled = min(1, count - 1)  # chunks, of which the first is compiled too
     frames_per_second = (total - compiled * CHUNK_FRAMES) / (clock_s[count] - clock_s[compiled])
 
-    def joined(chunks: list[_Judged], filtered: Replay | None = None) -> Replay:
-        pose, seen, located, decided, flip_probability, nees, branch = jax.tree.map(
-            lambda *leaves: np.concatenate(leaves)[:total], *chunks
+    def joined(chunks: list[Any], filtered: Replay | None = None) -> Replay:
+        known, (candidates, selected) = jax.tree.map(lambda *some: np.concatenate(some), *chunks)
+        pose, seen, located, decided, flip_probability, nees, branch = known
+        pose, candidates = (
+            np.asarray(poses_in_world(some, recording.markers.origin_m))
+            for some in (pose, candidates)
         )
-        pose = np.asarray(poses_in_world(pose, recording.markers.origin_m))
-        measured = pose, seen, located, decided, flip_probability, nees, branch
+        measured = (
+            pose,
+            seen,
+            located,
+            decided,
+            flip_probability,
+            nees,
+            branch,
+            candidates,
+            selected,
+        )
         return Replay(*measured, frames_per_second, corner_sigma_px, filtered)
 
     filtered = joined(chunks[:count])
@@ -172,25 +194,34 @@ def _best_e1_px2(
     return jnp.min(jnp.where(candidates.valid, candidates.e1_px2, jnp.inf))
 
 
-_Judged = tuple[Array, Array, Array, Array, Array, Array, Branch]  # the first fields of `Replay`
+# The first fields of `Replay`, and of every frame what it has of those where a track is seen.
+_Judged = tuple[tuple[Array, Array, Array, Array, Array, Array, Branch], tuple[Array, Array]]
 
 
 def _judge(poses: Localised, T_world_vehicle_true: Array) -> _Judged:
     """One frame of one track, judged against its reference."""
     truth = jaxlie.SE3(T_world_vehicle_true)
-    T, selected = poses.T_world_vehicle, poses.selected
-    return (
+    T, selected, of = poses.T_world_vehicle, poses.selected, poses.candidates
+    candidates = jnp.where(of.valid[:, None], of.T_vehicle_world.inverse().wxyz_xyz, jnp.nan)
+    judged = (
         T.wxyz_xyz,
         selected >= 0,
         poses.located,
         poses.decided,
         poses.flip_probability,
         nis(inverse_cayley(T.inverse() @ truth), poses.covariance),
-        judge_branch(poses.candidates, selected, truth),
+        judge_branch(of, selected, truth),
     )
+    return judged, (candidates, selected)
 
 
 _judge_all = kept(jax.vmap(jax.vmap(_judge, (0, None))))
+
+
+def _without_padding(judged: _Judged, frames: int) -> tuple[Any, list[np.ndarray]]:
+    """A chunk's first so many frames, and the rows where a track is seen."""
+    known, of_seen = jax.tree.map(lambda leaf: leaf[:frames], jax.device_get(judged))
+    return known, [rows[known[1]] for rows in of_seen]
 
 
 _Motions = tuple[np.ndarray | None, Preintegrated | None]  # by odometry, by an IMU
@@ -251,3 +282,80 @@ def errors(
     position_m[known] = np.linalg.norm(estimate[:, 4:] - truth[:, 4:], axis=1)
     rotation_deg[known] = np.rad2deg((turned.inv() * wanted).magnitude())
     return position_m, rotation_deg
+
+
+def scores(replay: Replay, recording: Recording) -> dict[str, float]:
+    """How often poses are of the wrong branch and claim to be right, and what that is worth.
+
+    Shares are of the poses with a reference: `wrong` another candidate is nearer to it, `outlier`
+    none is near, `decided`, `claimed` decided with a flip probability below `CLAIM`,
+    `wrong_of_claimed`. `log_score` is the mean of -log(probability given to what was true), beside
+    it that of the best constant; both leave outliers out, as neither branch is true. `anees` is the
+    mean squared error by the pose's covariance, which is 6 where that is right.
+    """
+    assert recording.reference is not None
+    judged = replay.seen & recording.reference.valid[:, None]
+    wrong, outlier, decided, doubt = (
+        np.asarray(each)[judged]
+        for each in (replay.branch.wrong, replay.branch.outlier, replay.decided,
+                     replay.flip_probability)
+    )  # fmt: skip
+    claimed = decided & (doubt < CLAIM)
+    known = wrong[~outlier]
+    probability = np.clip(doubt[~outlier], _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
+    nees = replay.nees[judged & replay.located]
+    position_m = errors(replay, recording)[0]
+    with np.errstate(invalid="ignore"):  # of no poses at all everything is NaN
+        share = np.clip(_mean(known), 1e-12, 1 - 1e-12)
+        return {
+            "wrong": _mean(wrong),
+            "outlier": _mean(outlier),
+            "decided": _mean(decided),
+            "claimed": _mean(claimed),
+            "wrong_of_claimed": _mean(wrong[claimed]),
+            "log_score": -_mean(np.where(known, np.log(probability), np.log1p(-probability))),
+            "log_score_of_a_constant": float(
+                -(share * np.log(share) + (1 - share) * np.log1p(-share))
+            ),
+            "anees": _mean(nees),
+            "nees_median": float(np.median(nees)) if len(nees) else np.nan,
+            "position_rms_m": float(np.sqrt(_mean(position_m[np.isfinite(position_m)] ** 2))),
+        }
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if len(values) else np.nan
+
+
+def explain_outliers(recording: Recording) -> str:
+    """A line about why many poses are far from the reference.
+
+    By the reference's poses the map is held against the corners that were seen: some markers are
+    not where it says, or it and the reference are in two frames.
+    """
+    assert recording.reference is not None
+    frames = np.flatnonzero(recording.reference.valid)
+    frames = frames[np.linspace(0, len(frames) - 1, min(len(frames), _MISFIT_FRAMES)).astype(int)]
+    rig, markers = recording.rig, recording.markers
+    on_map = poses_in_world(recording.reference.T_world_vehicle[frames], opposite(markers.origin_m))
+    there_px = jax.vmap(lambda T: rig.project(T.inverse(), markers.corners_world_m))(
+        jaxlie.SE3(jnp.asarray(on_map))
+    )
+    corners_px, visible = recording.lanes(frames)
+    off_px = np.linalg.norm(corners_px - np.asarray(there_px), axis=-1).mean(axis=-1)
+    sides_px = np.linalg.norm(corners_px - np.roll(corners_px, 1, axis=-2), axis=-1).mean(axis=-1)
+    off_px = np.nan_to_num(off_px, nan=np.inf)
+    misfits = {
+        marker_id: float(np.median(off_px[..., m][seen] / sides_px[..., m][seen]))
+        for m, marker_id in enumerate(markers.ids) if (seen := visible[..., m]).any()
+    }  # fmt: skip
+    off = [marker_id for marker_id, share in misfits.items() if share > _MISFIT_SHARE]
+    if 2 * len(off) > len(misfits):
+        return (
+            "many outliers: map and reference do not share a frame; by the reference "
+            f"{len(off)} of {len(misfits)} markers are not where they were seen"
+        )
+    if off:
+        names = ", ".join(map(str, off[:_IDS])) + (", ..." if len(off) > _IDS else "")
+        return f"many outliers: not where the map says, by the reference, are markers {names}"
+    return "many outliers, but map and reference agree with the corners"

@@ -1,5 +1,6 @@
 """Real four-camera recordings through the estimator, against TagSLAM's bundle adjustment."""
 
+import csv
 import dataclasses
 import json
 
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxnav.cli import main
 from jaxnav.core.filter.choose import LowestReprojection, PaperCost
@@ -19,7 +21,13 @@ from jaxnav.files import write_params
 from jaxnav.recordings.other import localise
 from jaxnav.recordings.other.localise import CHUNK_FRAMES, filter_frames, smooth_frames
 from jaxnav.recordings.other.recordings import Recording, read_recording
-from jaxnav.recordings.other.replay import Replay, errors, frames_in_view, replay
+from jaxnav.recordings.other.replay import (
+    Replay,
+    errors,
+    explain_outliers,
+    frames_in_view,
+    replay,
+)
 from jaxnav.recordings.ros.odometry_track import OdometryTrack
 from tests.helpers.compiling import jit_to_run
 
@@ -226,6 +234,45 @@ def test_limit_and_one_at_a_time_on_the_command_line(data_dir, tmp_path):
     assert 0 < wrong < 0.01
     assert wrong != settled
     assert len(list(tmp_path.glob("trajectory_marker_*.tum"))) == 9
+    # Who counts again by the lines of the detections finds the same.
+    with (tmp_path / "detections.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= summary["poses"]
+    own = {(row["frame"], row["id"]): row for row in rows}.values()
+    stamped = np.loadtxt(tmp_path / "reference.tum")
+    counted = []
+    for row in own:
+        at = np.argmin(np.abs(stamped[:, 0] - int(row["stamp_ns"]) / 1e9))
+        true = Rotation.from_quat(stamped[at, 4:])
+        turns = {
+            name: Rotation.from_quat([float(row[f"{name}_q{axis}"]) for axis in "xyzw"])
+            for name in ("reported", *(f"candidate_{n}" for n in range(4)))
+            if row.get(f"{name}_qw", "nan") != "nan"
+        }
+        off_deg = {
+            name: np.rad2deg((true.inv() * turn).magnitude()) for name, turn in turns.items()
+        }
+        assert off_deg.pop("reported") == pytest.approx(float(row["rotation_error_deg"]), abs=1e-3)
+        chosen, nearest = f"candidate_{row['chosen']}", min(off_deg, key=off_deg.get)
+        apart_deg = np.rad2deg((turns[chosen].inv() * turns[nearest]).magnitude())
+        counted.append(off_deg[nearest] <= 10 and apart_deg > 3)
+        assert 0 <= float(row["view_deg"]) < 90
+    assert np.mean(counted) == pytest.approx(wrong, abs=1e-9)
+
+
+def test_what_makes_outliers_is_named(test_7):
+    """Markers of the map that are elsewhere, or a reference in a frame of its own."""
+    assert "agree with the corners" in explain_outliers(test_7)
+    poses = np.array(test_7.markers.Ts_world_marker.wxyz_xyz)
+    poses[2, 4:] += 0.3
+    markers = dataclasses.replace(test_7.markers, Ts_world_marker=jaxlie.SE3(jnp.asarray(poses)))
+    off = explain_outliers(dataclasses.replace(test_7, markers=markers))
+    assert off.endswith(f"not where the map says, by the reference, are markers {markers.ids[2]}")
+    elsewhere = np.array(test_7.reference.T_world_vehicle)
+    elsewhere[:, 4] += 2.0
+    reference = test_7.reference._replace(T_world_vehicle=elsewhere)
+    said = explain_outliers(dataclasses.replace(test_7, reference=reference))
+    assert "map and reference do not share a frame" in said
 
 
 @pytest.mark.long
