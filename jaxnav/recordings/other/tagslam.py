@@ -18,6 +18,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -219,6 +220,7 @@ class _BodyEntry(ForeignEntry):
     odom_delay_s: Annotated[Number, within("delay_s")] = 0.0
     odom_sigma: OdometrySigma = OdometrySigma()
 
+    @cached_property
     def by_id(self) -> dict[int, _Tag]:
         """The tags that are on it, by their ids."""
         boards = (self.board, False), (self.staggered_board, True)
@@ -426,7 +428,7 @@ def _world(file: Path, settings: TagSlamFile | None, edges: _Edges, rig_body: st
     holders = {holder for holder, _ in _tagged(edges).values()} or {
         name
         for name, body in bodies.items()
-        if any(tag.T_body_tag is not None for tag in body.by_id().values())
+        if any(tag.T_body_tag is not None for tag in body.by_id.values())
     }
     moving = {name for name in holders if name in bodies and not bodies[name].is_static}
     if holders - moving:
@@ -452,7 +454,7 @@ def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges, rig_body: 
             Ts_world_marker[tag_id] = (parent, _to_root(frame, parents, world))
     for name in stands if not tagged else ():
         body = bodies[name]
-        for tag_id, tag in body.by_id().items():
+        for tag_id, tag in body.by_id.items():
             if tag.T_body_tag is not None and (name == world or body.pose is not None):
                 T_world_body = body.pose.pose() if body.pose is not None else _NOWHERE
                 T_world_marker = poses.compose(T_world_body, tag.T_body_tag)
@@ -465,7 +467,7 @@ def _markers(file: Path, settings: TagSlamFile | None, edges: _Edges, rig_body: 
     for tag_id in ids:
         name = Ts_world_marker[tag_id][0]
         holder = bodies.get(name) or bodies.get(settings.default_body or "")
-        own = holder and holder.by_id().get(tag_id)
+        own = holder and holder.by_id.get(tag_id)
         size_m = (own and own.size_m) or (holder and holder.default_tag_size)
         if not size_m:
             raise BadInput(
