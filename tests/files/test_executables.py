@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxnav.core.filter.choose import LowestReprojection
 from jaxnav.core.navigator import Navigator
-from jaxnav.drive.compiled_step import compiled_step
+from jaxnav.drive.compiled_step import compiled_step, strip_static
 from jaxnav.files import executables
 from jaxnav.recordings import drive_setup
 from tests import worlds
@@ -44,8 +44,16 @@ def test_it_is_the_step_and_is_compiled_once(tmp_path, monkeypatch):
     obs = worlds.observe(nav.rig, nav.markers, worlds.planar(*SEEN_FROM))
     jitted = jax.jit(lambda nav, state, obs: nav.step(state, obs))
 
+    def is_kept(function, nav):
+        name, *_ = executables._asked(function, (strip_static(nav), nav.init(), obs), {})
+        return (tmp_path / name).is_file()
+
+    assert not is_kept(Navigator.step, nav)
     first = compiled_step(nav, tmp_path)
     state, _ = first(nav.init(), obs)
+    assert is_kept(Navigator.step, nav)
+    assert is_kept(Navigator.step, moved)
+    assert not is_kept(Navigator.coast, nav)
     (file,) = tmp_path.iterdir()
     monkeypatch.setattr(executables, "_compiled", never)
     later, recalibrated = compiled_step(nav, tmp_path), compiled_step(moved, tmp_path)
@@ -158,8 +166,10 @@ def test_of_a_folder_that_is_not_this_users_nothing_is_loaded(tmp_path, monkeypa
         return one + other
 
     first = executables.program(both, told, folder)[0](list(told))
-    folder.chmod(0o777)
     (file,) = folder.iterdir()
+    assert executables._loaded(folder, file.name, list(told)) is not None
+    folder.chmod(0o777)
+    assert executables._loaded(folder, file.name, list(told)) is None
     was = file.read_bytes()
     monkeypatch.setattr(executables.pickle, "loads", never)
     again = executables.program(both, told, folder)[0](list(told))
