@@ -125,7 +125,7 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
     known = scores(result, recording)
     return {
         "poses_with_reference": int(judged.sum()),
-        "position_error_m": _spread(position_m) | {"rms": known["position_rms_m"]},
+        "position_error_m": _spread(position_m),
         "rotation_error_deg": _spread(rotation_deg),
         "wrong_branch_fraction": known["wrong"],
         f"wrong_branch_fraction_after_{_SETTLED_FRAMES}_frames": float(late),
@@ -140,8 +140,9 @@ def _against_reference(recording: Recording, result: Replay) -> dict[str, Any]:
 def _spread(values: np.ndarray) -> dict[str, float]:
     values = values[np.isfinite(values)]
     if not len(values):
-        return {"median": np.nan, "p95": np.nan}
-    return {"median": np.median(values), "p95": np.percentile(values, 95)}
+        return dict.fromkeys(("median", "p95", "rms"), np.nan)
+    rms = np.sqrt(np.mean(values**2))
+    return {"median": np.median(values), "p95": np.percentile(values, 95), "rms": rms}
 
 
 def _write_tracks(args: Arguments, recording: Recording, result: Replay) -> None:

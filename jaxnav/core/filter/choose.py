@@ -375,12 +375,9 @@ def judge_branch(
     )(candidates.T_vehicle_world)
     angles_rad = jnp.where(candidates.valid, angles_rad, jnp.inf)
     nearest_rad, chosen = jnp.min(angles_rad), jnp.maximum(selected, 0)
-    nearest = jnp.argmin(angles_rad)
-    of_chosen, of_nearest = (
-        jax.tree.map(lambda leaf: leaf[index], candidates.T_vehicle_world)  # noqa: B023
-        for index in (chosen, nearest)
-    )
-    is_other = rotation_error_rad(of_chosen, of_nearest) > jnp.deg2rad(SAME_BRANCH_DEG)
+    Ts = candidates.T_vehicle_world.wxyz_xyz
+    T_chosen, T_nearest = jaxlie.SE3(Ts[chosen]), jaxlie.SE3(Ts[jnp.argmin(angles_rad)])
+    is_other = rotation_error_rad(T_chosen, T_nearest) > jnp.deg2rad(SAME_BRANCH_DEG)
     judged = selected >= 0
     outlier = judged & (nearest_rad > jnp.deg2rad(OUTLIER_DEG))
     wrong = judged & ~outlier & is_other & (angles_rad[chosen] > nearest_rad + EVEN_RAD)

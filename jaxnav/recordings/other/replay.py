@@ -304,23 +304,18 @@ def scores(replay: Replay, recording: Recording) -> dict[str, float]:
     known = wrong[~outlier]
     probability = np.clip(doubt[~outlier], _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY)
     nees = replay.nees[judged & replay.located]
-    position_m = errors(replay, recording)[0]
-    with np.errstate(invalid="ignore"):  # of no poses at all everything is NaN
-        share = np.clip(_mean(known), 1e-12, 1 - 1e-12)
-        return {
-            "wrong": _mean(wrong),
-            "outlier": _mean(outlier),
-            "decided": _mean(decided),
-            "claimed": _mean(claimed),
-            "wrong_of_claimed": _mean(wrong[claimed]),
-            "log_score": -_mean(np.where(known, np.log(probability), np.log1p(-probability))),
-            "log_score_of_a_constant": float(
-                -(share * np.log(share) + (1 - share) * np.log1p(-share))
-            ),
-            "anees": _mean(nees),
-            "nees_median": float(np.median(nees)) if len(nees) else np.nan,
-            "position_rms_m": float(np.sqrt(_mean(position_m[np.isfinite(position_m)] ** 2))),
-        }
+    share = np.clip(_mean(known), 1e-12, 1 - 1e-12)
+    return {
+        "wrong": _mean(wrong),
+        "outlier": _mean(outlier),
+        "decided": _mean(decided),
+        "claimed": _mean(claimed),
+        "wrong_of_claimed": _mean(wrong[claimed]),
+        "log_score": -_mean(np.where(known, np.log(probability), np.log1p(-probability))),
+        "log_score_of_a_constant": float(-(share * np.log(share) + (1 - share) * np.log1p(-share))),
+        "anees": _mean(nees),
+        "nees_median": float(np.median(nees)) if len(nees) else np.nan,
+    }
 
 
 def _mean(values: np.ndarray) -> float:
