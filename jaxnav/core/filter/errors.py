@@ -45,6 +45,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.core.filter.bank import CameraErrors, PoseBelief, excess_of
 from jaxnav.core.linalg.small_matrices import (
+    cho_solve,
     cholesky,
     gram,
     matvec,
@@ -84,10 +85,33 @@ class ErrorsPosterior(eqx.Module):
     covariance: Float[Array, "*K t t"]
     rows: Float[Array, "*K t e"]  # selects them among all cameras' errors; zero: not in view
 
-    def given_pose(self, du: Float[Array, " d"], by_xi: Float[Array, "d d"]) -> "ErrorsPosterior":
-        """The errors of one hypothesis at u + du, by the pose's error there: by_xi is du / dxi."""
-        change = self.change + matvec(self.slope, du)
-        return ErrorsPosterior(change, product(self.slope, by_xi), self.covariance, self.rows)
+    def given_pose(
+        self,
+        du: Float[Array, " d"],
+        by_xi: Float[Array, "d d"],
+        of_pose: Float[Array, "d d"],
+        without_floor: Float[Array, "d d"],
+    ) -> "ErrorsPosterior":
+        """The errors of one hypothesis at u + du, by the pose's error there.
+
+        The floor is an error of the pose alone: what the errors follow is the share K of the
+        pose's error that is not floor. Did they follow all of it, a frame could leave them less
+        certain than it found them.
+
+        Args:
+            by_xi: du / dxi.
+            of_pose: covariance of u.
+            without_floor: what it would be without the floor.
+        """
+        K = cho_solve(cholesky(of_pose), without_floor).T
+        rest = jnp.eye(K.shape[0], dtype=K.dtype) - K
+        unfollowed = sandwich(rest, without_floor) + sandwich(K, of_pose - without_floor)
+        return ErrorsPosterior(
+            change=self.change + matvec(self.slope, du),
+            slope=product(self.slope, product(K, by_xi)),
+            covariance=self.covariance + sandwich(self.slope, unfollowed),
+            rows=self.rows,
+        )
 
 
 class ErrorsInView(eqx.Module):

@@ -233,10 +233,11 @@ def _fused(
     contradiction = solve_lower(sigma, u_alone)
     u_fused = solve_upper(sigma, contradiction)
     C = _between(information + ridge * eye, N)
+    by_corners = cholesky(information + eye)
     # log p(corners | prediction): the misfit at the best pose, and that pose's distance.
     misfit = cost - jnp.sum(gradient * (u - u_alone))
     least = jnp.where(linear, misfit + jnp.sum(contradiction**2), cost + jnp.sum(u**2))
-    log_evidence = log_share - (least + log_det(cholesky(information + eye))) / 2
+    log_evidence = log_share - (least + log_det(by_corners)) / 2
     log_likelihood = (
         log_scale
         + log_share
@@ -247,7 +248,8 @@ def _fused(
     if errors is not None:
         # Error at the corrected pose -> at the prediction -> in units of its sigma.
         back = product(unspread, sandwich(freedom.T, inverse_cayley_jacobian(xi)))
-        errors_in_view = errors.given_pose(u_fused - u, back)
+        without_floor = cho_solve(by_corners, eye)
+        errors_in_view = errors.given_pose(u_fused - u, back, C, without_floor)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, C)

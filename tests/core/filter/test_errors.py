@@ -163,6 +163,42 @@ def test_a_fit_with_cameras_that_are_off_is_dense_least_squares(navigator):
     assert np.all(np.linalg.eigvalsh(covariance) > 0)
 
 
+def test_a_camera_alone_leaves_what_two_have_learnt():
+    """The floor is an error of the pose: did the cameras' errors follow it, theirs would grow."""
+    rig, markers = off_rig(), worlds.paper_markers()
+    motion = Navigator(rig, markers, selector=MultiHypothesis()).motion
+    floor = jnp.repeat(jnp.asarray([MultiHypothesis().floor_m, MultiHypothesis().floor_rad]), 3)
+
+    @jax.jit
+    def frame(bank, obs):
+        bank = motion.predict(bank, obs)
+        prior = motion.poses(bank)
+        fit = fit_poses(
+            prior.T_world_vehicle, prior.covariance, prior.errors, prior,
+            snap(rig, markers, obs, 0.2), floor, 60,
+        )  # fmt: skip
+        mean, P = motion.offer(first(bank), first(fit.posterior)).posterior
+        return dataclasses.replace(bank, mean=mean[None], covariance=P[None])
+
+    T = worlds.planar(*VIEW)
+    both = worlds.observe(rig, markers, T, jnp.zeros((4, 1, 4, 2)))
+    both = dataclasses.replace(both, dt_s=jnp.asarray(1 / 30))
+    seen_by = np.flatnonzero(np.asarray(both.visible)[:, 0])
+    assert len(seen_by) == 2
+    alone = dataclasses.replace(both, visible=both.visible & (np.arange(4)[:, None] == seen_by[0]))
+    start = np.append(np.full(6, 0.01), np.append(np.full(6, 0.3), np.ones(4 * EACH)))
+    mean = np.append(T.wxyz_xyz, np.zeros(len(start) - 6))
+    bank = believing(motion, mean, np.diag(start**2))
+    for _ in range(30):
+        bank = frame(bank, both)
+    learnt = np.diagonal(np.asarray(bank.covariance[0]))[12:]
+    for _ in range(30):
+        bank = frame(bank, alone)
+    P = np.asarray(bank.covariance[0])
+    assert np.all(np.diagonal(P)[12:] < learnt + 1e-9)
+    assert np.linalg.eigvalsh(P)[0] > 0
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("body", ["car", "free"])
 def test_a_start_far_from_its_guess_keeps_a_covariance(navigator, body):
