@@ -45,7 +45,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxnav.core.filter.bank import CameraErrors, PoseBelief, excess_of
 from jaxnav.core.linalg.small_matrices import (
-    cho_solve,
     cholesky,
     gram,
     matvec,
@@ -89,27 +88,23 @@ class ErrorsPosterior(eqx.Module):
         self,
         du: Float[Array, " d"],
         by_xi: Float[Array, "d d"],
-        of_pose: Float[Array, "d d"],
-        without_floor: Float[Array, "d d"],
+        share: Float[Array, "d d"],
+        rest: Float[Array, "d d"],
     ) -> "ErrorsPosterior":
         """The errors of one hypothesis at u + du, by the pose's error there.
 
-        The floor is an error of the pose alone: what the errors follow is the share K of the
-        pose's error that is not floor. Did they follow all of it, a frame could leave them less
-        certain than it found them.
+        The floor is an error of the pose alone, and the errors follow what is not floor. Did they
+        follow all of it, a frame could leave them less certain than it found them.
 
         Args:
             by_xi: du / dxi.
-            of_pose: covariance of u.
-            without_floor: what it would be without the floor.
+            share: C0 C^-1, where C is the covariance of u, and C0 what it were without the floor.
+            rest: C0 - C0 C^-1 C0, of what is not floor given u.
         """
-        K = cho_solve(cholesky(of_pose), without_floor).T
-        rest = jnp.eye(K.shape[0], dtype=K.dtype) - K
-        unfollowed = sandwich(rest, without_floor) + sandwich(K, of_pose - without_floor)
         return ErrorsPosterior(
             change=self.change + matvec(self.slope, du),
-            slope=product(self.slope, product(K, by_xi)),
-            covariance=self.covariance + sandwich(self.slope, unfollowed),
+            slope=product(self.slope, product(share, by_xi)),
+            covariance=self.covariance + sandwich(self.slope, rest),
             rows=self.rows,
         )
 

@@ -224,7 +224,8 @@ def _fused(
     eye = jnp.eye(u.shape[0], dtype=dtype)
     # The minimum of the corners alone, u_alone with covariance R, is fused with the prediction.
     ridge = jnp.sqrt(jnp.finfo(dtype).eps)
-    alone = cholesky(information + ridge * eye)
+    information = information + ridge * eye
+    alone, by_corners = cholesky(information), cholesky(information + eye)
     u_alone = u - cho_solve(alone, gradient)
     unspread = solve_lower(root, eye)
     N = sandwich(unspread, sandwich(freedom.T, jnp.diag(floor**2)))
@@ -232,8 +233,7 @@ def _fused(
     sigma = cholesky(R + eye)  # of u_alone about the prediction
     contradiction = solve_lower(sigma, u_alone)
     u_fused = solve_upper(sigma, contradiction)
-    C = _between(information + ridge * eye, N)
-    by_corners = cholesky(information + eye)
+    C = _between(information, N)
     # log p(corners | prediction): the misfit at the best pose, and that pose's distance.
     misfit = cost - jnp.sum(gradient * (u - u_alone))
     least = jnp.where(linear, misfit + jnp.sum(contradiction**2), cost + jnp.sum(u**2))
@@ -248,8 +248,12 @@ def _fused(
     if errors is not None:
         # Error at the corrected pose -> at the prediction -> in units of its sigma.
         back = product(unspread, sandwich(freedom.T, inverse_cayley_jacobian(xi)))
-        without_floor = cho_solve(by_corners, eye)
-        errors_in_view = errors.given_pose(u_fused - u, back, C, without_floor)
+        # C0 = (A + I)^-1 is C without the floor; C^-1 = I + L W^-1 L' with A = L L' and
+        # W = I + L' N L.
+        floor_root = cholesky(eye + sandwich(alone.T, N))
+        share = cho_solve(by_corners, eye + gram(solve_lower(floor_root, alone.T).T))
+        rest = sandwich(cho_solve(by_corners, alone), eye - cho_solve(floor_root, eye))
+        errors_in_view = errors.given_pose(u_fused - u, back, share, rest)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, C)
