@@ -85,11 +85,7 @@ class ErrorsPosterior(eqx.Module):
     rows: Float[Array, "*K t e"]  # selects them among all cameras' errors; zero: not in view
 
     def given_pose(
-        self,
-        du: Float[Array, " d"],
-        by_xi: Float[Array, "d d"],
-        share: Float[Array, "d d"],
-        rest: Float[Array, "d d"],
+        self, du: Float[Array, " d"], by_xi: Float[Array, "d d"], rest: Float[Array, "d d"]
     ) -> "ErrorsPosterior":
         """The errors of one hypothesis at u + du, by the pose's error there.
 
@@ -97,13 +93,12 @@ class ErrorsPosterior(eqx.Module):
         follow all of it, a frame could leave them less certain than it found them.
 
         Args:
-            by_xi: du / dxi.
-            share: C0 C^-1, where C is the covariance of u, and C0 what it were without the floor.
-            rest: C0 - C0 C^-1 C0, of what is not floor given u.
+            by_xi: by the pose's error, what of du is not floor.
+            rest: covariance of what is not floor, given u.
         """
         return ErrorsPosterior(
             change=self.change + matvec(self.slope, du),
-            slope=product(self.slope, product(share, by_xi)),
+            slope=product(self.slope, by_xi),
             covariance=self.covariance + sandwich(self.slope, rest),
             rows=self.rows,
         )

@@ -249,11 +249,11 @@ def _fused(
         # Error at the corrected pose -> at the prediction -> in units of its sigma.
         back = product(unspread, sandwich(freedom.T, inverse_cayley_jacobian(xi)))
         # C0 = (A + I)^-1 is C without the floor; C^-1 = I + L W^-1 L' with A = L L' and
-        # W = I + L' N L.
+        # W = I + L' N L. Of u the share C0 C^-1 is not floor, and C0 - C0 C^-1 C0 is its rest.
         floor_root = cholesky(eye + sandwich(alone.T, N))
         share = cho_solve(by_corners, eye + gram(solve_lower(floor_root, alone.T).T))
         rest = sandwich(cho_solve(by_corners, alone), eye - cho_solve(floor_root, eye))
-        errors_in_view = errors.given_pose(u_fused - u, back, share, rest)
+        errors_in_view = errors.given_pose(u_fused - u, product(share, back), rest)
     T = (T_world_prior @ cayley(xi)).normalize()
     carry = product(cayley_jacobian(xi), spread)
     posterior_covariance = sandwich(carry, C)
