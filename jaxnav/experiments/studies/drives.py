@@ -61,6 +61,9 @@ PARAMETERS = {
     "imu": Parameter(
         "gyro of that class; none: the vehicle's", "", "none", choices=IMUS, static=True
     ),
+    "frame_rate_hz": Parameter(
+        "pictures a second; else the scenario's", "Hz", None, low=0.5, high=1000.0, static=True
+    ),
     "cameras": cameras("the first ones of the rig; by default all"),
     "corner_noise_px": Parameter("standard deviation of a corner coordinate", "px", 1.0, low=0.0),
     "corner_drift_px": Parameter(
@@ -184,6 +187,7 @@ class DriveStudy(Study):
             corner_drift_px=_given(value["corner_drift_px"], scenario.corner_drift_px),
             corner_lag_s=value["corner_lag_s"],
             corner_correlation=value["corner_correlation"],
+            frame_period_s=value["frame_rate_hz"] and 1 / value["frame_rate_hz"],
             duration_s=value["duration_s"],
         )
         return changed
