@@ -62,7 +62,7 @@ PARAMETERS = {
         "gyro of that class; none: the vehicle's", "", "none", choices=IMUS, static=True
     ),
     "frame_rate_hz": Parameter(
-        "pictures a second; else the scenario's", "Hz", None, low=0.5, high=1000.0, static=True
+        "pictures a second; else the scenario's", "Hz", None, low=0.5, high=15.0, static=True
     ),
     "cameras": cameras("the first ones of the rig; by default all"),
     "corner_noise_px": Parameter("standard deviation of a corner coordinate", "px", 1.0, low=0.0),
